@@ -1,0 +1,57 @@
+# Two commands matter: `make demo` and `make test`. Both set everything up first.
+.DEFAULT_GOAL := help
+.PHONY: help setup build demo test check format bench docs clean
+PYTHON ?= python3
+PROFILE ?= release
+VENV := .venv
+BIN := $(VENV)/bin
+RUST := $(shell find crates -name '*.rs' -o -name Cargo.toml) Cargo.toml Cargo.lock
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+$(VENV)/.tools: requirements.txt
+	@command -v cargo >/dev/null || { echo "weldscan needs a Rust toolchain (cargo); see https://rustup.rs" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit("weldscan needs Python >= 3.11, this is %d.%d: make PYTHON=python3.11 ..." % sys.version_info[:2] if sys.version_info < (3, 11) else 0)'
+	@echo "setting up $(VENV) ..."
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "python3 -m venv failed: on Debian, apt-get install python3-venv" >&2; exit 1; }
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
+	@touch $@
+
+$(VENV)/.built-$(PROFILE): $(VENV)/.tools $(RUST) pyproject.toml
+	@echo "building the core (profile $(PROFILE)) ..."
+	@VIRTUAL_ENV=$(abspath $(VENV)) $(BIN)/maturin develop --quiet --locked --profile $(PROFILE)
+	@rm -f $(VENV)/.built-* && touch $@
+
+setup: $(VENV)/.tools ## the virtual environment in .venv
+
+build: $(VENV)/.built-$(PROFILE) ## the core, installed into .venv
+
+demo: build ## a simulated cell, measured: summary and report
+	@$(BIN)/weldscan demo
+
+test: build ## every test, Rust and Python
+	cargo test --locked --workspace
+	$(BIN)/python -m pytest
+
+check: build ## format, lints, types, import contracts, documentation
+	cargo fmt --all --check
+	cargo clippy --locked --workspace --all-targets --all-features -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc --locked --workspace --no-deps --quiet
+	! grep -rnE 'pyo3|numpy' crates/weldcore/src --include='*.rs' | grep -v '^crates/weldcore/src/python/' | grep -vE ':[0-9]+:\s*//'
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/stubtest weldscan._weldcore
+	$(BIN)/lint-imports
+
+format: setup ## rewrite in the project's format
+	cargo fmt --all
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: build ## criterion
+	cargo bench --locked
+
+clean: ## remove what was built
+	rm -rf $(VENV) target

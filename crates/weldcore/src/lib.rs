@@ -1,0 +1,55 @@
+//! The algorithms of weldscan: from fringe images to the step of a weld.
+//!
+//! # Conventions
+//! - **Units**: millimetres, radians, pixels. A scalar's name ends in its unit (`radius_mm`, `sigma_px`).
+//! - **Frames**: a transform is named `a_from_b` and maps coordinates in `b` to coordinates in `a`, so that
+//!   `base_from_flange * flange_from_scanner` cancels by eye. The scanner's frame is its camera's, as OpenCV has it:
+//!   x right, y down, z forward; the centre of the first pixel is (0, 0).
+//! - **Clouds** are `&[[f64; 3]]`; a pixel without a point holds NaN. Images are row-major.
+//! - **Precision**: geometry is `f64` and is centred before any solve; modulation, background and sigma are `f32`.
+//! - **Determinism**: the same input gives the same bits on any number of threads. Work is cut into chunks of fixed
+//!   size, partial sums are added in chunk order, ties go to the lowest index (see [`threads`]).
+//! - **Errors**: one enum, [`Error`]. Nothing here panics on any input.
+//!
+//! # Rooms
+//! | module | what is in it |
+//! |---|---|
+//! | [`phase`] | fringe images to wrapped phase, modulation, background, noise |
+//! | [`unwrap`] | wrapped phase to absolute phase: temporal, Gray, spatial |
+//! | [`scanner`] | camera and projector with their lenses |
+//! | [`triangulate`] | phase to points; the reference-plane model of the paper |
+//! | [`transform`] | rigid transforms and their closed-form fit |
+//! | [`fit`] | plane, sphere, cylinder by orthogonal distance, with covariance; finding spheres in a cloud |
+//! | [`kdtree`] | exact nearest neighbours |
+//! | [`normals`] | surface normals from the pixel grid and from a bare cloud |
+//! | [`icp`] | iterative closest point |
+//! | [`distance`] | signed distance to clouds, meshes and analytic surfaces |
+//! | [`mesh`] | triangle meshes |
+//! | [`segment`] | reference wall, other wall and bead |
+//! | [`step`] | the step around the seam and its uncertainty |
+//! | [`simulate`] | ray-cast fringe images of analytic scenes |
+
+pub mod distance;
+pub mod error;
+pub mod fit;
+pub mod icp;
+pub mod kdtree;
+pub mod mesh;
+pub mod normals;
+pub mod phase;
+pub mod scanner;
+pub mod segment;
+pub mod simulate;
+pub mod step;
+pub mod threads;
+pub mod transform;
+pub mod triangulate;
+pub mod unwrap;
+
+#[cfg(feature = "python")]
+mod python;
+
+pub use error::{Error, Result};
+
+/// A point or a direction, in the frame that the context names.
+pub type Vec3 = nalgebra::Vector3<f64>;

@@ -1,0 +1,72 @@
+//! The binding, and the only home of pyo3 and numpy. Each wrapper does four things and no arithmetic: it checks shape
+//! and order, detaches from the interpreter and calls the core, maps the error, hands the result over without a copy.
+//!
+//! A room of the core has a file of the same name here with a `register` function.
+
+use numpy::{PyReadonlyArray2, PyUntypedArrayMethods};
+use pyo3::prelude::*;
+
+use crate::error::Error;
+use crate::transform::Transform;
+
+/// Turns a core error into the exception of the same kind from `weldscan.errors`.
+pub(crate) fn raise(py: Python<'_>, error: &Error) -> PyErr {
+    let class = match error {
+        Error::Shape { .. } | Error::NonFinite { .. } | Error::OutOfRange { .. } => "InputError",
+        Error::TooFew { .. } | Error::Degenerate { .. } | Error::NotFound { .. } => "GeometryError",
+    };
+    raise_as(py, class, error.to_string())
+}
+
+/// An exception of the named class of `weldscan.errors`.
+pub(crate) fn raise_as(py: Python<'_>, class: &str, message: String) -> PyErr {
+    match py.import("weldscan.errors").and_then(|m| m.getattr(class)).and_then(|c| c.call1((message,))) {
+        Ok(value) => PyErr::from_value(value),
+        Err(error) => error,
+    }
+}
+
+/// Detaches from the interpreter, computes, and maps the error.
+pub(crate) fn compute<T: Send>(py: Python<'_>, job: impl FnOnce() -> crate::Result<T> + Send) -> PyResult<T> {
+    py.detach(job).map_err(|e| raise(py, &e))
+}
+
+/// A C-contiguous `(n, 3)` float64 array as a slice of points, without a copy.
+pub(crate) fn points<'a>(what: &'static str, array: &'a PyReadonlyArray2<'_, f64>) -> PyResult<&'a [[f64; 3]]> {
+    let py = array.py();
+    let wrong = |got: String| {
+        raise(py, &Error::Shape { what, expected: "a C-contiguous float64 array of shape (n, 3)".into(), got })
+    };
+    if array.shape()[1] != 3 {
+        return Err(wrong(format!("shape {:?}", array.shape())));
+    }
+    let flat = array.as_slice().map_err(|_| wrong("strided".into()))?;
+    Ok(flat.as_chunks::<3>().0)
+}
+
+/// A 4x4 array as a rigid transform.
+pub(crate) fn transform(what: &'static str, array: &PyReadonlyArray2<'_, f64>) -> PyResult<Transform> {
+    let py = array.py();
+    if array.shape() != [4, 4] {
+        let got = format!("shape {:?}", array.shape());
+        return Err(raise(py, &Error::Shape { what, expected: "shape (4, 4)".into(), got }));
+    }
+    let view = array.as_array();
+    let rows = std::array::from_fn(|r| std::array::from_fn(|c| view[[r, c]]));
+    Transform::from_rows(&rows).map_err(|e| raise(py, &e))
+}
+
+/// Sets how many threads the core uses in this process; None returns to the default.
+#[pyfunction]
+#[pyo3(signature = (threads=None))]
+fn set_threads(py: Python<'_>, threads: Option<usize>) -> PyResult<()> {
+    crate::threads::set_threads(threads).map_err(|e| raise(py, &e))
+}
+
+#[pymodule]
+#[pyo3(name = "_weldcore")]
+fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    m.add_function(wrap_pyfunction!(set_threads, m)?)?;
+    Ok(())
+}

@@ -1,0 +1,181 @@
+"""What an inspection found: frozen values that the report only shows. All lengths mm, angles degrees where the name says so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum, StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class Verdict(StrEnum):
+    """The answer to the inspector."""
+
+    PASS = "PASS"
+    FAIL = "FAIL"
+    INCONCLUSIVE = "INCONCLUSIVE"
+    NOT_MEASURED = "NOT MEASURED"
+    NOT_ASSESSABLE = "NOT ASSESSABLE"
+
+
+class Label(IntEnum):
+    """What a point of the part belongs to."""
+
+    NONE = 0
+    REFERENCE_WALL = 1
+    OTHER_WALL = 2
+    BEAD = 3
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """One verdict under one clause of one norm."""
+
+    norm: str
+    clause: str
+    limit_mm: float | None
+    value_mm: float | None
+    expanded_uncertainty_mm: float | None
+    verdict: Verdict
+    reason: str
+    details: dict[str, Any] = field(default_factory=dict)
+    """Whatever else the norm's file says: edition, evidence, both limits where the table is ambiguous ..."""
+
+
+@dataclass(frozen=True)
+class BudgetLine:
+    """One contribution to the standard uncertainty of the judged step (GUM, k = 1)."""
+
+    name: str
+    standard_mm: float
+    derived_from: str
+
+
+@dataclass(frozen=True, eq=False)
+class Histogram:
+    """The paper's histogram of nearest-neighbour distances, and its 20 % rule."""
+
+    edges_mm: Floats
+    counts: NDArray[np.int64]
+    kept: NDArray[np.bool_]
+    step_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class StepResult:
+    """The step of the other wall over the reference wall; positive where the other wall stands further from the axis."""
+
+    mean_mm: float
+    median_mm: float
+    max_abs_mm: float
+    max_abs_at_deg: float
+    expanded_uncertainty_mm: float
+    """Of `max_abs_mm`, k = 2."""
+    histogram: Histogram | None
+    angle_deg: Floats
+    """Centres of the profile's bins: even degrees about the axis from the zero mark, those that were seen."""
+    step_mm: Floats
+    u_mm: Floats
+    """Expanded, k = 2, of each bin."""
+    budget: tuple[BudgetLine, ...]
+    harmonics_mm: dict[str, float]
+    """Fourier terms around the seam where the arc allows them: diameter difference, axis offset, ovality ..."""
+    angle_between_walls_deg: float
+    coverage_deg: float
+    """How much of the seam's turn was seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class SphereFit:
+    """One sphere of one artefact shot, scanner frame."""
+
+    centre_mm: Floats
+    covariance_mm2: Floats
+    rms_mm: float
+    points: int
+    residual_mm: float | None
+    """Distance between the placed centre and the touched one, after the hand-eye solve."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArtefactShot:
+    """What one artefact shot gave to the hand-eye solve."""
+
+    shot: str
+    spheres: tuple[SphereFit, ...]
+    distances_mm: Floats
+    """Between spheres 1-2, 2-3, 3-1, as scanned."""
+    residual_rms_mm: float
+    left_out_error_mm: float | None
+    """Error of this shot's centres placed with the hand-eye solved without it."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandEye:
+    """flange_from_scanner with its covariance."""
+
+    flange_from_scanner: Floats
+    covariance: Floats
+    """6x6, of a small rotation (rad, scanner axes) and translation (mm) applied on the scanner's side."""
+    residual_rms_mm: float
+    per_shot: tuple[ArtefactShot, ...]
+    touched_distances_mm: Floats
+    reduced_chi2: float | None
+    working_point_u_mm: float
+    """Standard uncertainty of a point at the working distance, placed in flange, worst axis."""
+    id: str
+    date: str
+
+
+@dataclass(frozen=True, eq=False)
+class PartCloud:
+    """Every measured point of the part, in base (in the scanner's frame where there is no robot)."""
+
+    points_mm: Floats
+    """(n, 3)"""
+    label: NDArray[np.uint8]
+    """`Label` per point."""
+    deviation_mm: NDArray[np.float32]
+    """Signed radial distance from the reference wall's surface."""
+    angle_deg: NDArray[np.float32]
+    """About the axis, right-handed, from the zero mark, in [0, 360)."""
+    axial_mm: NDArray[np.float32]
+    """Along the axis from the seam's centreline; the reference wall is negative."""
+    shot: NDArray[np.uint8]
+    """Index of the part shot."""
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """All of it. `step` is None where nothing could be measured; then `verdicts` say why."""
+
+    session: str
+    part: dict[str, Any]
+    method: str
+    """Which number is judged: surface or paper."""
+    frame: str
+    """base or scanner: the frame of `cloud`."""
+    step: StepResult | None
+    hand_eye: HandEye | None
+    cloud: PartCloud | None
+    verdicts: tuple[Judgement, ...]
+    left_out: tuple[tuple[str, str], ...]
+    """Shots that could not be used, with the reason."""
+    warnings: tuple[str, ...]
+    masks: dict[str, dict[str, int]]
+    """Per shot: how many pixels were ok, dark, saturated, in doubt of their fringe order, without a fit."""
+    timing_s: dict[str, float]
+    software: dict[str, str]
+
+    @property
+    def judged_mm(self) -> float | None:
+        """The number that the verdict is about."""
+        if self.step is None:
+            return None
+        if self.method == "paper":
+            return None if self.step.histogram is None else self.step.histogram.step_mm
+        return self.step.max_abs_mm

@@ -1,6 +1,6 @@
 """weldscan measures the edge displacement of butt welds from structured-light scans."""
 
-from weldscan._weldcore import __version__, set_threads
+from weldscan._weldcore import Lens, Scanner, __version__, set_threads
 from weldscan.errors import DeviceError, DeviceTimeout, GeometryError, InputError, NotMeasured, WeldscanError
 from weldscan.pose import (
     KukaPose,
@@ -20,7 +20,9 @@ __all__ = [
     "GeometryError",
     "InputError",
     "KukaPose",
+    "Lens",
     "NotMeasured",
+    "Scanner",
     "WeldscanError",
     "__version__",
     "format_e6axis",

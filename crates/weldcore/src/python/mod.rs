@@ -3,8 +3,11 @@
 //!
 //! A room of the core has a file of the same name here with a `register` function.
 
-use numpy::{PyReadonlyArray2, PyUntypedArrayMethods};
+use numpy::{PyArray, PyArrayMethods, PyReadonlyArray, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+mod scanner;
 
 use crate::error::Error;
 use crate::transform::Transform;
@@ -29,6 +32,42 @@ pub(crate) fn raise_as(py: Python<'_>, class: &str, message: String) -> PyErr {
 /// Detaches from the interpreter, computes, and maps the error.
 pub(crate) fn compute<T: Send>(py: Python<'_>, job: impl FnOnce() -> crate::Result<T> + Send) -> PyResult<T> {
     py.detach(job).map_err(|e| raise(py, &e))
+}
+
+/// Whatever numpy takes for an array of real numbers, as a C-contiguous float64 array of `D` dimensions; an array that
+/// is one already is not copied.
+pub(crate) fn floats<'py, D: numpy::ndarray::Dimension>(
+    what: &'static str,
+    given: &Bound<'py, PyAny>,
+) -> PyResult<PyReadonlyArray<'py, f64, D>> {
+    let py = given.py();
+    if let Ok(array) = given.cast::<PyArray<f64, D>>()
+        && array.is_c_contiguous()
+    {
+        return Ok(array.readonly());
+    }
+    let wrong = |got: String| {
+        let dimensions = D::NDIM.map_or(String::new(), |n| format!(" of {n} dimensions"));
+        raise(py, &Error::Shape { what, expected: format!("an array of real numbers{dimensions}"), got })
+    };
+    let array = py
+        .import("numpy")?
+        .call_method1("asarray", (given,))
+        .map_err(|_| wrong(given.get_type().name().map_or("another object".into(), |n| n.to_string())))?;
+    let dtype = array.getattr("dtype")?;
+    if !"biuf".contains(&dtype.getattr("kind")?.extract::<String>()?) {
+        return Err(wrong(format!("dtype {dtype}")));
+    }
+    let options = PyDict::new(py);
+    options.set_item("dtype", "float64")?;
+    let array = py.import("numpy")?.call_method("ascontiguousarray", (array,), Some(&options))?;
+    let shape: Vec<usize> = array.getattr("shape")?.extract()?;
+    Ok(array.cast_into::<PyArray<f64, D>>().map_err(|_| wrong(format!("shape {shape:?}")))?.readonly())
+}
+
+/// [`floats`] for a matrix.
+pub(crate) fn float_matrix<'py>(what: &'static str, given: &Bound<'py, PyAny>) -> PyResult<PyReadonlyArray2<'py, f64>> {
+    floats(what, given)
 }
 
 /// A C-contiguous `(n, 3)` float64 array as a slice of points, without a copy.
@@ -68,5 +107,6 @@ fn set_threads(py: Python<'_>, threads: Option<usize>) -> PyResult<()> {
 fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("__version__", env!("CARGO_PKG_VERSION"))?;
     m.add_function(wrap_pyfunction!(set_threads, m)?)?;
+    scanner::register(m)?;
     Ok(())
 }

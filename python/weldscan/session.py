@@ -1,0 +1,754 @@
+"""The session folder, `weldscan-session/1`: its models, reading it and writing it. `docs/formats.md` describes it.
+
+Everything that comes from outside is checked here, once; what follows may trust it. A complaint is one line that names
+the file and the field: `open-630/session.json: shots.3.flange_pose.B: NaN is not a number`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import secrets
+import shutil
+import struct
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar, cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
+
+from weldscan.errors import InputError
+
+Image: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
+Frames: TypeAlias = Sequence[Sequence[Image]]
+"""Exposures x frames of one shot, each (height, width) uint8 or uint16, all alike."""
+
+SCHEMA = "weldscan-session/1"
+HAND_EYE_SCHEMA = "weldscan-hand-eye/1"
+
+# How far a matrix of a file may be from a rotation: what six printed decimals leave, and no more.
+ROTATION_TOLERANCE = 1e-5
+# Below this sine of the angle between axis and zero mark (0.06 degrees) no angle about the axis is defined.
+PARALLEL_SINE = 1e-3
+# More pixels than any camera has: a typing error, or an attempt to exhaust the memory.
+MAX_SIDE_PX = 65_535
+MAX_JSON_BYTES = 16 * 1024 * 1024
+
+
+# --- what the fields are made of --------------------------------------------------------------------------------------
+
+# A billion of anything (1000 km, for a length) is a typing error, and squares of it still fit into a number.
+Real = Annotated[float, Field(ge=-1e9, le=1e9)]
+Positive = Annotated[float, Field(gt=0, le=1e9)]
+Vector = tuple[Real, Real, Real]
+Matrix = tuple[tuple[Real, ...], ...]
+Pixels = Annotated[int, Field(ge=1, le=MAX_SIDE_PX)]
+
+
+def _square(size: int) -> Callable[[Matrix], Matrix]:
+    def check(matrix: Matrix) -> Matrix:
+        if len(matrix) != size or any(len(row) != size for row in matrix):
+            raise ValueError(f"should be {size} rows of {size} numbers")
+        return matrix
+
+    return check
+
+
+def _rigid(matrix: Matrix) -> Matrix:
+    """A 4x4 rigid transform: orthonormal, right-handed, last row 0 0 0 1."""
+    array = np.asarray(_square(4)(matrix))
+    rotation = array[:3, :3]
+    if not np.array_equal(array[3], [0, 0, 0, 1]):
+        raise ValueError("the last row should be 0 0 0 1")
+    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if not off <= ROTATION_TOLERANCE:
+        raise ValueError(
+            f"the rotation is not orthonormal: off by {off:.2g}, at most {ROTATION_TOLERANCE:g} is accepted"
+        )
+    if np.linalg.det(rotation) < 0:
+        raise ValueError("the rotation is mirrored (its determinant is -1)")
+    return matrix
+
+
+def _camera_matrix(matrix: Matrix) -> Matrix:
+    (fx, skew, _), (zero, fy, _), last = _square(3)(matrix)
+    if not (fx > 0 and fy > 0):
+        raise ValueError("the focal lengths K[0][0] and K[1][1] should be positive")
+    if skew != 0 or zero != 0 or last != (0, 0, 1):
+        raise ValueError("should read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not supported")
+    return matrix
+
+
+def _non_zero(vector: Vector) -> Vector:
+    if not math.hypot(*vector) > 1e-9:
+        raise ValueError("is a zero vector")
+    return vector
+
+
+def _plain_name(name: str) -> str:
+    """A name that is also a folder's: it can neither leave the session's folder nor hide in it."""
+    if not re.fullmatch(r"[^\W_][\w .+-]{0,99}", name) or name[-1] in ". ":
+        raise ValueError(f"{name!r} cannot name a folder: letters, digits, '_', '-', '+', '.' and spaces only")
+    return name
+
+
+def _covariance(matrix: Matrix) -> Matrix:
+    array = np.asarray(_square(6)(matrix))
+    scale = float(np.abs(array).max())
+    if not np.allclose(array, array.T, atol=1e-9 * scale) or np.linalg.eigvalsh(array).min() < -1e-9 * scale:
+        raise ValueError("is not a covariance: it should be symmetric and without negative eigenvalues")
+    return matrix
+
+
+Rigid = Annotated[Matrix, AfterValidator(_rigid)]
+Direction = Annotated[Vector, AfterValidator(_non_zero)]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True, strict=True, populate_by_name=True)
+
+
+# --- the models, from the leaves up -----------------------------------------------------------------------------------
+
+
+class LensSpec(_Model):
+    """A camera's or a projector's pinhole with OpenCV's distortion k1 k2 p1 p2 [k3]; pixel centres at integers."""
+
+    width: Pixels
+    height: Pixels
+    K: Annotated[Matrix, AfterValidator(_camera_matrix)]
+    dist: Annotated[tuple[Real, ...], Field(min_length=4, max_length=5)]
+
+
+class ScannerSpec(_Model):
+    """A calibrated camera-projector pair; the scanner's frame is the camera's."""
+
+    camera: LensSpec
+    projector: LensSpec
+    camera_from_projector: Rigid
+
+    @model_validator(mode="after")
+    def _has_a_baseline(self) -> Self:
+        if not math.hypot(*(row[3] for row in self.camera_from_projector[:3])) > 1e-6:
+            raise ValueError(
+                "camera_from_projector: camera and projector stand in one place, so nothing is triangulated"
+            )
+        return self
+
+
+class FringeSet(_Model):
+    """`steps` images of one frequency; column u of step i: 0.5 + 0.5 cos(2 pi (periods (u + 0.5)/width - i/steps))."""
+
+    axis: Literal["x", "y"]
+    periods: Positive
+    steps: Annotated[int, Field(ge=3, le=1000)]
+
+
+class ArtefactSpec(_Model):
+    """The plate with three calibrated spheres; `centres_base` were touched with the robot's probe."""
+
+    kind: Literal["three-sphere plate"] = "three-sphere plate"
+    sphere_diameter: Positive
+    centres_base: tuple[Vector, Vector, Vector]
+
+    @model_validator(mode="after")
+    def _is_a_triangle(self) -> Self:
+        centres = np.asarray(self.centres_base)
+        for i, j in ((0, 1), (1, 2), (2, 0)):
+            distance = float(np.linalg.norm(centres[i] - centres[j]))
+            if distance < self.sphere_diameter:
+                raise ValueError(
+                    f"centres_base: spheres {i + 1} and {j + 1} are {distance:.4g} mm apart, "
+                    f"less than their diameter of {self.sphere_diameter:g} mm"
+                )
+        sides = centres[1] - centres[0], centres[2] - centres[0]
+        if np.linalg.norm(np.cross(*sides)) < PARALLEL_SINE * np.linalg.norm(sides[0]) * np.linalg.norm(sides[1]):
+            raise ValueError("centres_base: the three centres lie on one line, which fixes no rotation about it")
+        return self
+
+
+class PartSpec(_Model):
+    """The welded part, as the drawing has it. Directions are in base, or in the scanner's frame without a robot."""
+
+    kind: Literal["pipe"]
+    outside_diameter: Positive
+    wall_thickness: Positive
+    joint: Annotated[str, Field(min_length=1, max_length=100)]
+    axis_base: Direction | None = None
+    """From the reference wall to the other wall."""
+    zero_base: Direction | None = None
+    """The 0 degree mark; angles are right-handed about the axis."""
+    other_wall_thickness: Positive | None = None
+    """Rated thickness of the other wall, where it differs."""
+    machined_after_welding: bool = False
+    side: Literal["welding", "opposite"] = "welding"
+    """Which side of the joint was scanned."""
+
+    @model_validator(mode="after")
+    def _is_a_pipe(self) -> Self:
+        for name in ("wall_thickness", "other_wall_thickness"):
+            wall = getattr(self, name)
+            if wall is not None and wall >= self.outside_diameter / 2:
+                raise ValueError(
+                    f"{name}: {wall:g} mm is not less than the outside radius of {self.outside_diameter / 2:g} mm"
+                )
+        if self.axis_base is not None and self.zero_base is not None:
+            axis, zero = np.asarray(self.axis_base), np.asarray(self.zero_base)
+            if np.linalg.norm(np.cross(axis, zero)) < PARALLEL_SINE * np.linalg.norm(axis) * np.linalg.norm(zero):
+                raise ValueError("zero_base: is parallel to axis_base, so no angle about the axis is defined")
+        elif (self.axis_base is None) != (self.zero_base is None):
+            absent = "axis_base" if self.axis_base is None else "zero_base"
+            raise ValueError(f"{absent}: missing, while the other of axis_base and zero_base is given")
+        return self
+
+
+class RobotSpec(_Model):
+    """Which robot carried the scanner."""
+
+    model: Annotated[str, Field(max_length=200)]
+
+
+class FlangePose(_Model):
+    """A KUKA pose of the flange in base: mm, and degrees as R = Rz(A) Ry(B) Rx(C)."""
+
+    X: Real
+    Y: Real
+    Z: Real
+    A: Real
+    B: Real
+    C: Real
+
+
+class ShotSpec(_Model):
+    """One stack of fringe images, in `shots/NAME`."""
+
+    name: Annotated[str, AfterValidator(_plain_name)]
+    of: Literal["artefact", "part"]
+    flange_pose: FlangePose | None = None
+    exposures: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)] | None = None
+    """Relative exposure of each stack; absent: one stack."""
+
+    @model_validator(mode="after")
+    def _exposures_differ(self) -> Self:
+        if self.exposures is not None and len(set(self.exposures)) < len(self.exposures):
+            raise ValueError("exposures: one of them is there twice")
+        return self
+
+
+class HandEyeSpec(_Model):
+    """`weldscan-hand-eye/1`: where the scanner sits on the flange, as `weldscan calibrate hand-eye` writes it."""
+
+    schema_: Literal["weldscan-hand-eye/1"] = Field(alias="schema")
+    id: Annotated[str, Field(min_length=1, max_length=200)]
+    date: Annotated[str, Field(max_length=100)]
+    flange_from_scanner: Rigid
+    covariance: Annotated[Matrix, AfterValidator(_covariance)]
+    """6x6, of a small rotation (rad, scanner axes) and translation (mm) applied on the scanner's side."""
+    residual_rms_mm: Annotated[float, Field(ge=0)]
+    reduced_chi2: Annotated[float, Field(ge=0)] | None = None
+    working_point_u_mm: Annotated[float, Field(ge=0)] | None = None
+    touched_distances_mm: tuple[float, ...] | None = None
+    per_shot: tuple[dict[str, Any], ...] = ()
+    """For the record; nothing reads it."""
+
+
+class Session(_Model):
+    """All that an inspector knows of one inspection: `session.json`. `folder` says where its images are."""
+
+    schema_: Literal["weldscan-session/1"] = Field(alias="schema")
+    name: Annotated[str, Field(min_length=1, max_length=200)]
+    scanner: ScannerSpec
+    fringes: Annotated[tuple[FringeSet, ...], Field(min_length=1, max_length=100)]
+    artefact: ArtefactSpec | None = None
+    hand_eye: HandEyeSpec | Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    """The document itself, or the name of its file in the session's folder (`read_session` puts the document here)."""
+    part: PartSpec | None = None
+    robot: RobotSpec | None = None
+    shots: Annotated[tuple[ShotSpec, ...], Field(min_length=1, max_length=10_000)]
+    _folder: Path | None = PrivateAttr(default=None)
+
+    @property
+    def folder(self) -> Path:
+        """Where the session was read from."""
+        if self._folder is None:
+            raise InputError("this session was made in memory: it has no folder to read images from")
+        return self._folder
+
+    @property
+    def artefact_shots(self) -> tuple[ShotSpec, ...]:
+        """The shots of the three-sphere plate."""
+        return tuple(shot for shot in self.shots if shot.of == "artefact")
+
+    @property
+    def part_shots(self) -> tuple[ShotSpec, ...]:
+        """The shots of the welded part."""
+        return tuple(shot for shot in self.shots if shot.of == "part")
+
+    @property
+    def has_robot(self) -> bool:
+        """Whether the shots have poses; without them the part is measured in the scanner's own frame."""
+        return self.shots[0].flange_pose is not None
+
+    @model_validator(mode="after")
+    def _agrees_with_itself(self) -> Self:
+        for complaint in (*self._about_fringes(), *self._about_shots(), *self._about_placing()):
+            raise ValueError(complaint)
+        return self
+
+    def _about_fringes(self) -> Iterator[str]:
+        last: dict[str, float] = {}
+        for index, fringe in enumerate(self.fringes):
+            side = self.scanner.projector.width if fringe.axis == "x" else self.scanner.projector.height
+            before = last.get(fringe.axis, 0.0)
+            if fringe.periods == before:
+                yield f"fringes.{index}.periods: {fringe.periods:g} is there twice on axis {fringe.axis}"
+            if fringe.periods < before:
+                yield f"fringes.{index}.periods: {fringe.periods:g} after {before:g}; they should ascend on each axis"
+            if 2 * fringe.periods > side:
+                yield f"fringes.{index}.periods: {side} projector pixels cannot show {fringe.periods:g} fringes"
+            last[fringe.axis] = fringe.periods
+
+    def _about_shots(self) -> Iterator[str]:
+        seen: dict[str, int] = {}
+        for index, shot in enumerate(self.shots):
+            # Two names that differ in case alone are one folder on some file systems.
+            twin = seen.setdefault(shot.name.casefold(), index)
+            if twin != index:
+                yield f"shots.{index}.name: {shot.name!r} is also the name of shots.{twin}"
+        if self.artefact is None and self.artefact_shots:
+            index = self.shots.index(self.artefact_shots[0])
+            yield f"shots.{index}.of: a shot of the artefact, but the session describes no artefact"
+        if self.part is None and self.part_shots:
+            yield "part: missing, though there are shots of it"
+
+    def _about_placing(self) -> Iterator[str]:
+        posed = [shot.flange_pose is not None for shot in self.shots]
+        if any(posed) and not all(posed):
+            yield f"shots.{posed.index(False)}.flange_pose: missing, though shots.{posed.index(True)} has one"
+        if any(posed):
+            if self.part_shots and self.part is not None and self.part.axis_base is None:
+                yield "part.axis_base: missing; only a session without a robot may leave it out"
+            if self.hand_eye is not None and self.artefact_shots:
+                yield "hand_eye: given together with artefact shots; leave one of them out"
+            if self.hand_eye is None and not self.artefact_shots:
+                yield "hand_eye: missing, and there are no artefact shots to find it from"
+            return
+        if self.robot is not None:
+            yield "shots.0.flange_pose: missing, though the session names a robot"
+        if self.hand_eye is not None:
+            yield "hand_eye: given, but the shots have no flange_pose to use it with"
+        if self.artefact_shots or len(self.part_shots) != 1:
+            yield (
+                "shots.0.flange_pose: missing; only a session with exactly one shot, and that of the part, "
+                "can do without a robot"
+            )
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read_session(folder: str | os.PathLike[str]) -> Session:
+    """The checked contents of `folder/session.json`; its images stay on disk until `read_frames` wants them.
+
+    Args:
+        folder: a session folder, `weldscan-session/1`.
+
+    Raises:
+        InputError: the file is missing, is not JSON in UTF-8, or a field of it is unknown, missing, out of range or
+            contradicts another; one line that names file and field.
+    """
+    folder = Path(folder)
+    path = folder / "session.json"
+    if not folder.is_dir():
+        raise InputError(f"{folder}: {'is not a folder' if folder.exists() else 'no such folder'}")
+    session = _parse(path, Session)
+    if isinstance(session.hand_eye, str):
+        name = session.hand_eye
+        inside = (folder / name).resolve()
+        if Path(name).is_absolute() or folder.resolve() not in inside.parents:
+            raise InputError(f"{path}: hand_eye: {name!r} is not a file inside the session's folder")
+        session = session.model_copy(update={"hand_eye": read_hand_eye(folder / name)})
+    session._folder = folder
+    return session
+
+
+def read_hand_eye(path: str | os.PathLike[str]) -> HandEyeSpec:
+    """The hand-eye document that `weldscan calibrate hand-eye` wrote, checked.
+
+    Raises:
+        InputError: missing, not JSON, or a field is wrong; one line that names file and field.
+    """
+    return _parse(Path(path), HandEyeSpec)
+
+
+_M = TypeVar("_M", bound=_Model)
+
+
+def _parse(path: Path, model: type[_M]) -> _M:
+    text = read_text(path)
+    try:
+        json.loads(text, object_pairs_hook=_no_duplicates)
+    except RecursionError:
+        raise InputError(f"{path}: is nested too deeply") from None
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: is not JSON: {error.msg} in line {error.lineno}, column {error.colno}") from None
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    try:
+        return model.model_validate_json(text)
+    except ValidationError as error:
+        raise InputError(f"{path}: {explain(error)}") from None
+
+
+def read_text(path: Path) -> str:
+    """A small text file in UTF-8; whatever is wrong with it is an `InputError` that names it."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_JSON_BYTES + 1)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if len(data) > MAX_JSON_BYTES:
+        raise InputError(f"{path}: is larger than {MAX_JSON_BYTES >> 20} MB")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not UTF-8: byte {error.start} is 0x{data[error.start]:02x}") from None
+
+
+def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    document = dict(pairs)
+    if len(document) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"{next(name for name in names if names.count(name) > 1)}: the field is there twice")
+    return document
+
+
+def explain(error: ValidationError) -> str:
+    """The first complaint of pydantic in one line, as `field.path: what is wrong`, and how many more there are."""
+    complaints = error.errors(include_url=False)
+    first = complaints[0]
+    value = _short(first.get("input"))
+    match first["type"]:
+        case "missing":
+            message = "missing"
+        case "extra_forbidden":
+            message = "unknown field"
+        case "finite_number":
+            message = f"{value} is not a number"
+        case "value_error":
+            message = str(first["ctx"]["error"])
+        case "tuple_type" | "list_type":
+            message = f"should be a list, not {value}"
+        case "model_type" | "model_attributes_type" | "dict_type":
+            message = f"should be an object, not {value}"
+        case _:
+            message = first["msg"].removeprefix("Input ").removeprefix("should be a valid ")
+            message = f"should be a valid {message}" if "valid" in first["msg"] else message
+            message = f"{message}, not {value}" if message.startswith("should be") else message
+    # A union's branch is not part of the field's name.
+    where = ".".join(str(step) for step in first["loc"] if str(step) not in ("HandEyeSpec", "constrained-str", "str"))
+    more = f" (and {len(complaints) - 1} more)" if len(complaints) > 1 else ""
+    return f"{where}: {message}{more}" if where else f"{message}{more}"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "infinity"
+    text = json.dumps(value, default=str, ensure_ascii=False)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+# --- images -----------------------------------------------------------------------------------------------------------
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_COLOURS = {2: "colour", 3: "colour (a palette)", 4: "grey with transparency", 6: "colour with transparency"}
+CRITICAL = (b"IHDR", b"PLTE", b"IDAT", b"IEND")
+# Camera noise has no repetitions to look for: a Huffman code of the differences is smaller and three times as fast.
+PNG_PARAMETERS = [
+    *(cv2.IMWRITE_PNG_COMPRESSION, 1),
+    *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
+    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP),
+]
+
+
+def frame_names(session: Session, shot: ShotSpec) -> list[list[str]]:
+    """The file names of a shot's fringe images: exposures x frames, in the order of fringes, then of steps."""
+    frames = range(sum(fringe.steps for fringe in session.fringes))
+    return [[f"{prefix}{frame:03d}.png" for frame in frames] for prefix in _prefixes(shot)]
+
+
+def _prefixes(shot: ShotSpec) -> list[str]:
+    exposures = len(shot.exposures or (1.0,))
+    return [""] if exposures == 1 else [f"e{index}_" for index in range(exposures)]
+
+
+def read_frames(session: Session, shot: ShotSpec) -> list[list[Image]]:
+    """The fringe images of one shot: exposures x frames, in the session's order, without the white ones.
+
+    Args:
+        session: as `read_session` gave it.
+        shot: one of `session.shots`.
+
+    Returns:
+        A list per exposure of (height, width) arrays, uint8 or uint16, all of the same depth.
+
+    Raises:
+        InputError: an image is missing, damaged, in colour, of another size than the camera, or of another depth than
+            the rest; the line names the file, what it is and what it should be.
+    """
+    return _read_shots(session, [shot])[0]
+
+
+def iter_frames(session: Session, shots: Iterable[ShotSpec]) -> Iterator[tuple[ShotSpec, list[list[Image]]]]:
+    """`read_frames` of one shot after the other; the next shot is read while the caller works on this one."""
+    with ThreadPoolExecutor(1) as reader:
+        waiting: list[tuple[ShotSpec, Future[list[list[Image]]]]] = []
+        for shot in shots:
+            waiting.append((shot, reader.submit(read_frames, session, shot)))
+            if len(waiting) == 2:
+                first, future = waiting.pop(0)
+                yield first, future.result()
+        for last, future in waiting:
+            yield last, future.result()
+
+
+def _read_shots(session: Session, shots: Sequence[ShotSpec]) -> list[list[list[Image]]]:
+    size = session.scanner.camera.width, session.scanner.camera.height
+    names = [
+        session.folder / "shots" / shot.name / name
+        for shot in shots
+        for row in frame_names(session, shot)
+        for name in row
+    ]
+    # Inflating takes nearly all the time, and OpenCV lets go of the interpreter meanwhile.
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        images = iter(list(pool.map(lambda path: read_image(path, size), names)))
+    stacks = [[[next(images) for _ in row] for row in frame_names(session, shot)] for shot in shots]
+    for shot, exposures in zip(shots, stacks, strict=True):
+        depth = exposures[0][0].dtype
+        for row, files in zip(exposures, frame_names(session, shot), strict=True):
+            for image, name in zip(row, files, strict=True):
+                if image.dtype != depth:
+                    raise InputError(
+                        f"{session.folder / 'shots' / shot.name / name}: is of {image.dtype.itemsize * 8} bits, "
+                        f"while the shot's first image is of {depth.itemsize * 8}"
+                    )
+    return stacks
+
+
+def read_image(path: Path, size: tuple[int, int] | None = None) -> Image:
+    """One grey PNG of 8 or 16 bits, (height, width) uint8 or uint16.
+
+    OpenCV fills what a damaged file lacks with zeros and complains on stderr; here the file's own structure is checked
+    first.
+
+    Args:
+        path: the file.
+        size: (width, height) that it must have, pixels.
+
+    Raises:
+        InputError: see `read_frames`.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such image") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    try:
+        width, height, depth, data = _checked_png(data)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    if size is not None and (width, height) != size:
+        raise InputError(f"{path}: is {width}x{height} pixels, but the camera has {size[0]}x{size[1]}")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None or image.shape != (height, width) or image.dtype.itemsize * 8 != depth:
+        raise InputError(f"{path}: is a damaged PNG: its pixels cannot be decoded")
+    return cast("Image", image)
+
+
+def _checked_png(data: bytes) -> tuple[int, int, int, bytes]:
+    """Width, height, depth and the bytes to decode (critical chunks only) of a whole grey PNG; ValueError otherwise."""
+    if not data:
+        raise ValueError("is empty")
+    if not data.startswith(PNG_SIGNATURE):
+        raise ValueError("is not a PNG image")
+    chunks, at, kind = [data[:8]], 8, b""
+    while kind != b"IEND":
+        if at + 12 > len(data):
+            raise ValueError(f"is truncated: the PNG breaks off after {len(data)} bytes")
+        length, kind = struct.unpack_from(">I4s", data, at)
+        end = at + 12 + length
+        if end > len(data):
+            raise ValueError(f"is truncated: the PNG breaks off after {len(data)} bytes")
+        if zlib.crc32(memoryview(data)[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end]):
+            raise ValueError(f"is a damaged PNG: the check sum at byte {end - 4} does not fit")
+        if at == 8 and (kind != b"IHDR" or length != 13):
+            raise ValueError("is a damaged PNG: it does not begin with its header")
+        if kind in CRITICAL:
+            chunks.append(data[at:end])
+        at = end
+    width, height, depth, colour = struct.unpack_from(">IIBB", data, 16)
+    if colour != 0:
+        raise ValueError(f"is {PNG_COLOURS.get(colour, 'of an unknown kind')}, but should be grey (one channel)")
+    if depth not in (8, 16):
+        raise ValueError(f"is of {depth} bits, but should be of 8 or 16")
+    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
+        raise ValueError(f"is {width}x{height} pixels")
+    # Colour profiles and the like make the decoder talk; the pixels need none of them.
+    whole = sum(map(len, chunks)) == len(data)
+    return width, height, depth, data if whole else b"".join(chunks)
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def write_session(
+    folder: str | os.PathLike[str],
+    session: Session,
+    frames: Iterable[tuple[str, Frames]],
+    *,
+    whites: Mapping[str, Sequence[Image]] | None = None,
+    extra: Mapping[str, str] | None = None,
+) -> Session:
+    """Writes a session as a whole: into a temporary folder beside `folder`, which then takes its name.
+
+    Args:
+        folder: must not exist yet, or be empty.
+        session: what goes into `session.json`.
+        frames: per shot its name and its images, as `read_frames` gives them; may be a generator, so that one shot
+            after the other is made and written. `dict.items()` does as well.
+        whites: per shot the evenly lit image of each exposure, where there is one.
+        extra: further text files by name, `touch.csv` for one.
+
+    Returns:
+        The session as read back from `folder`.
+
+    Raises:
+        InputError: the folder is in the way or cannot be written, or the images do not fit the session.
+    """
+    folder = Path(folder)
+    with whole_folder(folder) as partial:
+        document = session.model_dump(mode="json", exclude_none=True, by_alias=True)
+        (partial / "session.json").write_text(to_json(document), encoding="utf-8")
+        for name, text in (extra or {}).items():
+            (partial / _plain_name(name)).write_text(text, encoding="utf-8")
+        shots = {shot.name: shot for shot in session.shots}
+        camera = session.scanner.camera
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            for name, stacks in frames:
+                shot = shots.pop(name, None)
+                if shot is None:
+                    raise InputError(f"frames: {name!r} is not a shot of the session, or came twice")
+                exposures, files = [list(stack) for stack in stacks], frame_names(session, shot)
+                white = (whites or {}).get(name)
+                if white is not None:
+                    exposures = [[*row, image] for row, image in zip(exposures, white, strict=True)]
+                    files = [[*row, f"{p}white.png"] for row, p in zip(files, _prefixes(shot), strict=True)]
+                have, need = [[len(row) for row in rows] for rows in (exposures, files)]
+                if have != need:
+                    raise InputError(f"frames: {name!r} has {have} images, not {need}")
+                (partial / "shots" / name).mkdir(parents=True)
+                targets = [partial / "shots" / name / file for row in files for file in row]
+                size = camera.height, camera.width
+                images = [image for row in exposures for image in row]
+                list(pool.map(_write_image, targets, images, [size] * len(images)))
+        if shots:
+            raise InputError(f"frames: none for shot {next(iter(shots))!r}")
+    return read_session(folder)
+
+
+def _write_image(path: Path, image: Image, size: tuple[int, int]) -> None:
+    if image.shape != size or image.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"frames: {path.parent.name}/{path.name} is {image.shape} {image.dtype}, not {size} uint8 or uint16"
+        )
+    done, data = cv2.imencode(".png", image, PNG_PARAMETERS)
+    if not done:
+        raise InputError(f"frames: {path.name} cannot be encoded")
+    path.write_bytes(data.tobytes())
+
+
+class whole_folder:
+    """A folder that appears complete or not at all: `with whole_folder(path) as partial: ...` fills `partial`.
+
+    Args:
+        path: where the folder is to be. It must not exist, or be empty, or be one that `replaces` accepts.
+        replaces: says whether an existing folder is an earlier result that the new one may replace.
+
+    Raises:
+        InputError: something else is in the way, or it cannot be written.
+    """
+
+    def __init__(self, path: Path, replaces: Callable[[Path], bool] = lambda _: False) -> None:
+        self.path, self.replaces = (Path(path) if Path(path).name else Path(path).resolve()), replaces
+        self.partial = self._sibling("partial")
+
+    def _sibling(self, suffix: str) -> Path:
+        return self.path.parent / f".{self.path.name}.{secrets.token_hex(4)}.{suffix}"
+
+    def __enter__(self) -> Path:
+        self.check(self.path, self.replaces)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.partial.mkdir()
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be written: {error.strerror or error}") from None
+        return self.partial
+
+    @staticmethod
+    def check(path: Path, replaces: Callable[[Path], bool] = lambda _: False) -> None:
+        """Says early what would be in the way later."""
+        if path.is_symlink() or (path.exists() and not path.is_dir()):
+            raise InputError(f"{path}: exists and is not a folder")
+        if path.is_dir() and any(path.iterdir()) and not replaces(path):
+            raise InputError(f"{path}: exists and holds something else; name another folder or remove it")
+        above = next((parent for parent in path.absolute().parents if parent.exists()), None)
+        if above is None or not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+            raise InputError(f"{path}: cannot be written: {above} is not a folder that may be written to")
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        try:
+            if kind is None:
+                self._swap()
+        except OSError as failure:
+            raise InputError(f"{self.path}: cannot be written: {failure.strerror or failure}") from None
+        finally:
+            shutil.rmtree(self.partial, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise InputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+
+    def _swap(self) -> None:
+        """Moves the old folder aside, the new one in, and only then removes the old."""
+        self.check(self.path, self.replaces)
+        old = None
+        if self.path.is_dir():
+            old = self.path.rename(self._sibling("old"))
+        try:
+            self.partial.rename(self.path)
+        except OSError:
+            if old is not None:
+                old.rename(self.path)
+            raise
+        finally:
+            if old is not None:
+                shutil.rmtree(old, ignore_errors=True)
+
+
+def to_json(document: Any) -> str:
+    """JSON for people: indented, with innermost lists on one line each; never NaN."""
+    text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
+    # No string holds a raw line break, so that what is joined here is white space between values.
+    return re.sub(r"\[\n[^\[\]{}\"]*\]", lambda found: "[" + " ".join(found[0][1:-1].split()) + "]", text) + "\n"

@@ -62,7 +62,7 @@ GONE = object()
 
 def changed(path: str, value: object, document: dict = SESSION) -> dict:
     """The session with one field replaced (or taken away)."""
-    document = copy.deepcopy(document)
+    document = json.loads(json.dumps(document))  # nothing shared any more
     *parents, last = [int(step) if step.isdigit() else step for step in path.split(".")]
     holder = document
     for step in parents:
@@ -295,7 +295,6 @@ PNG = png()
         (PNG[: len(PNG) // 2], "is truncated"),
         (PNG[:8], "is truncated"),
         (PNG[:45] + bytes([PNG[45] ^ 1]) + PNG[46:], "is a damaged PNG: the check sum"),
-        (png(rows=b"\7" + b"\0" * 53), "is a damaged PNG: its pixels cannot be decoded"),
         (png(width=9), "is 9x6 pixels, but the camera has 8x6"),
         (png(width=2**31 - 1, rows=b""), "is 2147483647x6 pixels"),
         (png(colour=2), "is colour, but should be grey"),

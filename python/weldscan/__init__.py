@@ -1,5 +1,10 @@
 """weldscan measures the edge displacement of butt welds from structured-light scans."""
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from weldscan._weldcore import Lens, Scanner, __version__, set_threads
 from weldscan.errors import DeviceError, DeviceTimeout, GeometryError, InputError, NotMeasured, WeldscanError
 from weldscan.pose import (
@@ -14,6 +19,23 @@ from weldscan.pose import (
     parse_frame,
 )
 
+if TYPE_CHECKING:
+    from weldscan.session import Session, iter_frames, read_frames, read_session, write_session
+
+# The faces are imported when they are asked for: they bring pydantic and OpenCV, which an algorithm does not need.
+_LAZY = {
+    "weldscan.session": ("Session", "iter_frames", "read_frames", "read_session", "write_session"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _LAZY.items():
+        if name in names:
+            value = globals()[name] = getattr(import_module(module), name)
+            return value
+    raise AttributeError(f"module 'weldscan' has no attribute {name!r}")
+
+
 __all__ = [
     "DeviceError",
     "DeviceTimeout",
@@ -23,15 +45,20 @@ __all__ = [
     "Lens",
     "NotMeasured",
     "Scanner",
+    "Session",
     "WeldscanError",
     "__version__",
     "format_e6axis",
     "format_e6pos",
     "format_frame",
+    "iter_frames",
     "kuka_from_matrix",
     "matrix_from_kuka",
     "parse_e6axis",
     "parse_e6pos",
     "parse_frame",
+    "read_frames",
+    "read_session",
     "set_threads",
+    "write_session",
 ]

@@ -1,4 +1,4 @@
-"""What an inspection found: frozen values that the report only shows. All lengths mm, angles degrees where the name says so."""
+"""What an inspection found: frozen values that the report only shows. Lengths in mm; degrees where the name says so."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Histogram:
 
 @dataclass(frozen=True, eq=False)
 class StepResult:
-    """The step of the other wall over the reference wall; positive where the other wall stands further from the axis."""
+    """The step of the other wall over the reference wall; positive where the other wall is further from the axis."""
 
     mean_mm: float
     median_mm: float

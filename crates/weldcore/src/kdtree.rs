@@ -1,1 +1,668 @@
-//! (to be written)
+//! Exact nearest neighbours among points in space.
+//!
+//! The tree splits at medians along the widest side, and stores three binary splits as one node of eight children, so
+//! that the boxes of a node, and the points of a leaf, are each measured with a handful of vector instructions. Leaves
+//! and nodes lie in order and need no pointers: the children of node `i` are `8 i .. 8 i + 8` of the level below.
+//!
+//! **Exact** means: the answer is that of a plain loop computing `(x² + y²) + z²` of the differences in `f64`, bit for
+//! bit, and of equally distant points the lowest index. Pruning is safe in floating point, because subtraction,
+//! multiplication and addition round monotonically: no point of a box comes out nearer than its box.
+//!
+//! **Memory** beyond the caller's points: 28 bytes a point in leaves, 7 in boxes, 35 in all.
+
+use multiversion::multiversion;
+use rayon::prelude::*;
+
+use crate::error::{Error, Result, require_count, require_finite};
+use crate::threads;
+
+/// Points in a leaf and children of a node: one AVX-512 vector, two of AVX2.
+const WIDTH: usize = 8;
+/// Ranges below this are ordered without handing half of them to another thread.
+const SERIAL: usize = 16 * 1024;
+/// Queries handed to a thread at a time.
+const QUERIES: usize = 1024;
+/// Coordinates beyond this would overflow when squared.
+pub const LARGEST_COORDINATE: f64 = 1e150;
+/// No neighbour yet: every real one is nearer.
+const FAR: f64 = f64::MAX;
+/// Levels that 2³² points need, each with at most `WIDTH - 1` children put aside.
+const DEEPEST: usize = 11 * (WIDTH - 1) + 1;
+
+/// Eight points, coordinate by coordinate.
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+struct Leaf([[f64; WIDTH]; 3]);
+
+/// The bounding boxes of eight children; a child that does not exist is infinitely far.
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+struct Boxes {
+    low: [[f64; WIDTH]; 3],
+    high: [[f64; WIDTH]; 3],
+}
+
+/// A point on its way into the tree.
+#[derive(Clone, Copy)]
+struct Item {
+    at: [f64; 3],
+    index: u32,
+}
+
+/// A k-d tree over a cloud. It keeps its own copy of the points.
+#[derive(Clone)]
+pub struct KdTree {
+    len: usize,
+    leaves: Vec<Leaf>,
+    /// Which point each place of a leaf holds.
+    indices: Vec<[u32; WIDTH]>,
+    /// All levels one after the other, from the parents of the leaves up to the root.
+    boxes: Vec<Boxes>,
+    /// Where each level starts in `boxes`.
+    levels: Vec<usize>,
+}
+
+impl KdTree {
+    /// Builds the tree: `n log n` time on all threads, the same tree on any number of them.
+    ///
+    /// # Errors
+    /// [`Error::TooFew`] for no points, [`Error::NonFinite`], and [`Error::OutOfRange`] for coordinates beyond
+    /// [`LARGEST_COORDINATE`] or 2³² - 1 points and more.
+    pub fn new(points: &[[f64; 3]]) -> Result<Self> {
+        let what = "points";
+        require_count(what, 1, points.len())?;
+        require_range(what, points)?;
+        if u32::try_from(points.len()).is_err() {
+            let expected = "fewer than 2^32 points".into();
+            return Err(Error::OutOfRange { what, expected, value: points.len().to_string() });
+        }
+        Ok(threads::install(|| Self::build(points)))
+    }
+
+    fn build(points: &[[f64; 3]]) -> Self {
+        let mut items: Vec<Item> = points.par_iter().enumerate().map(|(i, &at)| Item { at, index: i as u32 }).collect();
+        let mut reach = WIDTH;
+        while reach * WIDTH < items.len() {
+            reach *= WIDTH;
+        }
+        order(&mut items, reach);
+        let blank = (Leaf([[f64::INFINITY; WIDTH]; 3]), [u32::MAX; WIDTH]);
+        let (leaves, indices): (Vec<Leaf>, Vec<[u32; WIDTH]>) = items
+            .par_chunks(WIDTH)
+            .map(|chunk| {
+                let (mut leaf, mut index) = blank;
+                for (place, item) in chunk.iter().enumerate() {
+                    for (axis, row) in leaf.0.iter_mut().enumerate() {
+                        row[place] = item.at[axis];
+                    }
+                    index[place] = item.index;
+                }
+                (leaf, index)
+            })
+            .unzip();
+        drop(items);
+        let mut tree = Self { len: points.len(), leaves, indices, boxes: Vec::new(), levels: Vec::new() };
+        tree.bound();
+        tree
+    }
+
+    /// The boxes, from the leaves up to one root.
+    fn bound(&mut self) {
+        let around_leaves: Vec<Boxes> =
+            self.leaves.par_chunks(WIDTH).map(|leaves| Boxes::around(leaves.iter().map(Leaf::extent))).collect();
+        self.boxes = around_leaves;
+        self.levels.push(0);
+        let mut start = 0;
+        while self.boxes.len() - start > 1 {
+            let above: Vec<Boxes> =
+                self.boxes[start..].chunks(WIDTH).map(|nodes| Boxes::around(nodes.iter().map(Boxes::extent))).collect();
+            start = self.boxes.len();
+            self.levels.push(start);
+            self.boxes.extend(above);
+        }
+        self.boxes.shrink_to_fit();
+    }
+
+    /// How many points are in the tree.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether the tree holds no point; it always holds one.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// What the tree takes, in bytes.
+    pub fn bytes(&self) -> usize {
+        size_of_val(&*self.leaves) + size_of_val(&*self.indices) + size_of_val(&*self.boxes)
+    }
+
+    /// The nearest point to each query: distances, mm, and indices; of equally distant points the lowest index.
+    ///
+    /// # Errors
+    /// [`Error::NonFinite`] and [`Error::OutOfRange`] as in [`KdTree::new`].
+    pub fn nearest(&self, queries: &[[f64; 3]]) -> Result<(Vec<f64>, Vec<u32>)> {
+        require_range("queries", queries)?;
+        let (mut distance, mut index) = (vec![0.0; queries.len()], vec![0; queries.len()]);
+        threads::install(|| {
+            (queries.par_chunks(QUERIES), distance.par_chunks_mut(QUERIES), index.par_chunks_mut(QUERIES))
+                .into_par_iter()
+                .for_each(|(queries, distance, index)| nearest_of(self, queries, distance, index));
+        });
+        Ok((distance, index))
+    }
+
+    /// The `k` nearest points to each query, nearest first, equally distant ones by index: distances, mm, and indices,
+    /// `k` after `k`.
+    ///
+    /// # Errors
+    /// As [`KdTree::nearest`], and [`Error::OutOfRange`] unless `1 <= k <= len`.
+    pub fn knn(&self, queries: &[[f64; 3]], k: usize) -> Result<(Vec<f64>, Vec<u32>)> {
+        require_range("queries", queries)?;
+        if !(1..=self.len).contains(&k) {
+            let expected = format!("from 1 to the {} points of the tree", self.len);
+            return Err(Error::OutOfRange { what: "k", expected, value: k.to_string() });
+        }
+        let wanted = queries.len().checked_mul(k).filter(|&n| n <= isize::MAX as usize / 16);
+        let Some(wanted) = wanted else {
+            let expected = "small enough for its answer to fit into memory".into();
+            return Err(Error::OutOfRange { what: "k", expected, value: k.to_string() });
+        };
+        let (mut distance, mut index) = (vec![0.0; wanted], vec![0; wanted]);
+        threads::install(|| {
+            let chunks = (distance.par_chunks_mut(QUERIES * k), index.par_chunks_mut(QUERIES * k));
+            (queries.par_chunks(QUERIES), chunks.0, chunks.1)
+                .into_par_iter()
+                .for_each(|(queries, distance, index)| nearest_k_of(self, queries, k, distance, index));
+        });
+        Ok((distance, index))
+    }
+
+    /// All points within `r_mm` of each query, the border included, nearest first, equally distant ones by index.
+    ///
+    /// # Errors
+    /// As [`KdTree::nearest`], and [`Error::OutOfRange`] where `r_mm` is negative or NaN.
+    pub fn radius(&self, queries: &[[f64; 3]], r_mm: f64) -> Result<Vec<Within>> {
+        require_range("queries", queries)?;
+        if r_mm.is_nan() || r_mm < 0.0 {
+            return Err(Error::OutOfRange { what: "r", expected: "at least 0".into(), value: r_mm.to_string() });
+        }
+        let chunks: Vec<Vec<Within>> =
+            threads::install(|| queries.par_chunks(QUERIES).map(|queries| within_of(self, queries, r_mm)).collect());
+        Ok(chunks.into_iter().flatten().collect())
+    }
+
+    /// The search that all others share: offers every point that may be nearer than `found.bound()`, near boxes first.
+    #[inline(always)]
+    fn search(&self, q: &[f64; 3], aside: &mut Aside, found: &mut impl Found) {
+        let mut depth = 0;
+        let (mut level, mut node) = (self.levels.len() - 1, 0);
+        loop {
+            let near = self.boxes[self.levels[level] + node].squared_distances(q);
+            let (first, least) = least(&near);
+            if least <= found.bound() {
+                if level == 0 {
+                    self.offer_leaf(node * WIDTH + first, q, found);
+                }
+                let mut others = at_most(&near, found.bound()) & !(1 << first);
+                while others != 0 {
+                    let child = others.trailing_zeros() as usize & (WIDTH - 1);
+                    others &= others - 1;
+                    if level > 0 {
+                        aside.0[depth] = (near[child], (level - 1) as u32, (node * WIDTH + child) as u32);
+                        depth += 1;
+                    } else if near[child] <= found.bound() {
+                        self.offer_leaf(node * WIDTH + child, q, found);
+                    }
+                }
+                if level > 0 {
+                    (level, node) = (level - 1, node * WIDTH + first);
+                    continue;
+                }
+            }
+            loop {
+                if depth == 0 {
+                    return;
+                }
+                depth -= 1;
+                let (distance, l, n) = aside.0[depth];
+                if distance <= found.bound() {
+                    (level, node) = (l as usize, n as usize);
+                    break;
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn offer_leaf(&self, leaf: usize, q: &[f64; 3], found: &mut impl Found) {
+        let distances = self.leaves[leaf].squared_distances(q);
+        let mut near = at_most(&distances, found.bound());
+        while near != 0 {
+            let place = near.trailing_zeros() as usize & (WIDTH - 1);
+            near &= near - 1;
+            found.offer(distances[place], self.indices[leaf][place], (leaf * WIDTH + place) as u32);
+        }
+    }
+
+    /// A first guess without looking back: the nearest point of the leaf that is reached by nearest boxes.
+    #[inline(always)]
+    fn dive(&self, q: &[f64; 3], found: &mut impl Found) {
+        let mut node = 0;
+        for &start in self.levels.iter().rev() {
+            let (first, _) = least(&self.boxes[start + node].squared_distances(q));
+            node = node * WIDTH + first;
+        }
+        self.offer_leaf(node, q, found);
+    }
+
+    /// The point in a place of the tree's own order.
+    #[inline(always)]
+    fn in_place(&self, place: u32) -> [f64; 3] {
+        let (leaf, i) = (place as usize / WIDTH, place as usize % WIDTH);
+        self.leaves[leaf].0.map(|row| row[i])
+    }
+}
+
+impl std::fmt::Debug for KdTree {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "KdTree({} points)", self.len)
+    }
+}
+
+/// The points within a radius of a query, nearest first.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Within {
+    /// Distances, mm, ascending.
+    pub distance_mm: Vec<f64>,
+    /// Indices of the points.
+    pub index: Vec<u32>,
+}
+
+/// Boxes put aside during a search: squared distance, level, node.
+struct Aside([(f64, u32, u32); DEEPEST]);
+
+impl Aside {
+    fn new() -> Self {
+        Self([(0.0, 0, 0); DEEPEST])
+    }
+}
+
+/// What a search looks for.
+trait Found {
+    /// Points further than this (squared) are of no interest; points exactly as far may be.
+    fn bound(&self) -> f64;
+    fn offer(&mut self, squared: f64, index: u32, place: u32);
+}
+
+/// The nearest.
+struct Nearest {
+    squared: f64,
+    index: u32,
+}
+
+impl Found for Nearest {
+    #[inline(always)]
+    fn bound(&self) -> f64 {
+        self.squared
+    }
+
+    #[inline(always)]
+    fn offer(&mut self, squared: f64, index: u32, _: u32) {
+        if squared < self.squared || (squared == self.squared && index < self.index) {
+            (self.squared, self.index) = (squared, index);
+        }
+    }
+}
+
+/// The `k` nearest, ascending.
+struct NearestK<'a> {
+    squared: &'a mut [f64],
+    index: &'a mut [u32],
+}
+
+impl Found for NearestK<'_> {
+    #[inline(always)]
+    fn bound(&self) -> f64 {
+        self.squared[self.squared.len() - 1]
+    }
+
+    #[inline(always)]
+    fn offer(&mut self, squared: f64, index: u32, _: u32) {
+        let mut at = self.squared.len();
+        while at > 0
+            && (squared < self.squared[at - 1] || (squared == self.squared[at - 1] && index < self.index[at - 1]))
+        {
+            at -= 1;
+            if at + 1 < self.squared.len() {
+                self.squared[at + 1] = self.squared[at];
+                self.index[at + 1] = self.index[at];
+            }
+        }
+        if at < self.squared.len() {
+            self.squared[at] = squared;
+            self.index[at] = index;
+        }
+    }
+}
+
+/// All within a radius.
+struct WithinRadius {
+    bound: f64,
+    r: f64,
+    all: Vec<(f64, u32)>,
+}
+
+impl Found for WithinRadius {
+    #[inline(always)]
+    fn bound(&self) -> f64 {
+        self.bound
+    }
+
+    #[inline(always)]
+    fn offer(&mut self, squared: f64, index: u32, _: u32) {
+        let distance = squared.sqrt();
+        if distance <= self.r {
+            self.all.push((distance, index));
+        }
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
+fn nearest_of(tree: &KdTree, queries: &[[f64; 3]], distance: &mut [f64], index: &mut [u32]) {
+    let mut aside = Aside::new();
+    for ((q, distance), index) in queries.iter().zip(distance).zip(index) {
+        let mut found = Nearest { squared: FAR, index: u32::MAX };
+        tree.dive(q, &mut found);
+        tree.search(q, &mut aside, &mut found);
+        (*distance, *index) = (found.squared.sqrt(), found.index);
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
+fn nearest_k_of(tree: &KdTree, queries: &[[f64; 3]], k: usize, distance: &mut [f64], index: &mut [u32]) {
+    let mut aside = Aside::new();
+    for ((q, distance), index) in queries.iter().zip(distance.chunks_mut(k)).zip(index.chunks_mut(k)) {
+        distance.fill(FAR);
+        index.fill(u32::MAX);
+        tree.search(q, &mut aside, &mut NearestK { squared: distance, index });
+        for d in distance {
+            *d = d.sqrt();
+        }
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
+fn within_of(tree: &KdTree, queries: &[[f64; 3]], r: f64) -> Vec<Within> {
+    let mut aside = Aside::new();
+    // Wide enough for the rounding of the square and of the root that decides.
+    let bound = (r * r * (1.0 + 4.0 * f64::EPSILON)).min(FAR).max(f64::MIN_POSITIVE);
+    let mut found = WithinRadius { bound, r, all: Vec::new() };
+    let mut answers = Vec::with_capacity(queries.len());
+    for q in queries {
+        tree.search(q, &mut aside, &mut found);
+        found.all.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        let (distance_mm, index) = found.all.drain(..).unzip();
+        answers.push(Within { distance_mm, index });
+    }
+    answers
+}
+
+/// Orders the points so that each run of `reach`, `reach / 8`, ... 8 points from the start is compact in space.
+fn order(items: &mut [Item], mut reach: usize) {
+    if items.len() <= WIDTH {
+        return;
+    }
+    while items.len() <= reach {
+        reach /= WIDTH;
+    }
+    let middle = items.len().div_ceil(reach) / 2 * reach;
+    match widest(items) {
+        0 => select::<0>(items, middle),
+        1 => select::<1>(items, middle),
+        _ => select::<2>(items, middle),
+    }
+    let (low, high) = items.split_at_mut(middle);
+    if low.len() > SERIAL {
+        rayon::join(|| order(low, reach), || order(high, reach));
+    } else {
+        order(low, reach);
+        order(high, reach);
+    }
+}
+
+fn select<const AXIS: usize>(items: &mut [Item], middle: usize) {
+    items.select_nth_unstable_by(middle, |a, b| a.at[AXIS].total_cmp(&b.at[AXIS]));
+}
+
+fn widest(items: &[Item]) -> usize {
+    let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+    for item in items {
+        for axis in 0..3 {
+            low[axis] = min(low[axis], item.at[axis]);
+            high[axis] = max(high[axis], item.at[axis]);
+        }
+    }
+    let side = [high[0] - low[0], high[1] - low[1], high[2] - low[2]];
+    if side[0] >= side[1] && side[0] >= side[2] {
+        0
+    } else if side[1] >= side[2] {
+        1
+    } else {
+        2
+    }
+}
+
+/// Fails where a coordinate is not finite, or too large to be squared.
+fn require_range(what: &'static str, points: &[[f64; 3]]) -> Result<()> {
+    if points.iter().flatten().all(|c| c.abs() <= LARGEST_COORDINATE) {
+        return Ok(());
+    }
+    require_finite(what, points)?;
+    let expected = format!("within ±{LARGEST_COORDINATE:e} in every coordinate");
+    Err(Error::OutOfRange { what, expected, value: "a larger one".into() })
+}
+
+// One vector instruction each, unlike `f64::min` and `max`, which have rules about NaN.
+#[inline(always)]
+fn min(a: f64, b: f64) -> f64 {
+    if a < b { a } else { b }
+}
+
+#[inline(always)]
+fn max(a: f64, b: f64) -> f64 {
+    if a > b { a } else { b }
+}
+
+/// The lowest of eight and its place.
+#[inline(always)]
+fn least(values: &[f64; WIDTH]) -> (usize, f64) {
+    let mut least = values[0];
+    for &v in values {
+        least = min(v, least);
+    }
+    (at_most(values, least).trailing_zeros() as usize & (WIDTH - 1), least)
+}
+
+/// A bit for each of the eight that is not above `bound`.
+#[inline(always)]
+fn at_most(values: &[f64; WIDTH], bound: f64) -> u32 {
+    let mut bits = 0;
+    for (i, &v) in values.iter().enumerate() {
+        bits |= u32::from(v <= bound) << i;
+    }
+    bits
+}
+
+impl Leaf {
+    #[inline(always)]
+    fn squared_distances(&self, q: &[f64; 3]) -> [f64; WIDTH] {
+        std::array::from_fn(|i| {
+            let (x, y, z) = (self.0[0][i] - q[0], self.0[1][i] - q[1], self.0[2][i] - q[2]);
+            (x * x + y * y) + z * z
+        })
+    }
+
+    /// The box around the points, low and high corner; places without a point do not count.
+    fn extent(&self) -> ([f64; 3], [f64; 3]) {
+        let high = |row: [f64; WIDTH]| row.into_iter().filter(|&v| v != f64::INFINITY).fold(f64::NEG_INFINITY, max);
+        (self.0.map(|row| row.into_iter().fold(f64::INFINITY, min)), self.0.map(high))
+    }
+}
+
+impl Boxes {
+    fn around(children: impl Iterator<Item = ([f64; 3], [f64; 3])>) -> Self {
+        let mut boxes = Self { low: [[f64::INFINITY; WIDTH]; 3], high: [[f64::NEG_INFINITY; WIDTH]; 3] };
+        for (i, (low, high)) in children.enumerate() {
+            for axis in 0..3 {
+                boxes.low[axis][i] = low[axis];
+                boxes.high[axis][i] = high[axis];
+            }
+        }
+        boxes
+    }
+
+    #[inline(always)]
+    fn squared_distances(&self, q: &[f64; 3]) -> [f64; WIDTH] {
+        std::array::from_fn(|i| {
+            let outside = |axis: usize| max(max(self.low[axis][i] - q[axis], q[axis] - self.high[axis][i]), 0.0);
+            let (x, y, z) = (outside(0), outside(1), outside(2));
+            (x * x + y * y) + z * z
+        })
+    }
+
+    fn extent(&self) -> ([f64; 3], [f64; 3]) {
+        (
+            self.low.map(|row| row.into_iter().fold(f64::INFINITY, min)),
+            self.high.map(|row| row.into_iter().fold(f64::NEG_INFINITY, max)),
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// The oracle: a plain loop.
+    fn sorted(points: &[[f64; 3]], q: &[f64; 3]) -> Vec<(f64, u32)> {
+        let mut all: Vec<(f64, u32)> = points
+            .iter()
+            .enumerate()
+            .map(|(i, p)| {
+                let d: [f64; 3] = std::array::from_fn(|k| p[k] - q[k]);
+                ((d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt(), i as u32)
+            })
+            .collect();
+        all.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        all
+    }
+
+    fn agrees(points: &[[f64; 3]], queries: &[[f64; 3]], k: usize, r: f64) {
+        let tree = KdTree::new(points).unwrap();
+        let k = k.clamp(1, points.len());
+        let (d1, i1) = tree.nearest(queries).unwrap();
+        let (dk, ik) = tree.knn(queries, k).unwrap();
+        let within = tree.radius(queries, r).unwrap();
+        for (n, q) in queries.iter().enumerate() {
+            let all = sorted(points, q);
+            assert_eq!((d1[n], i1[n]), all[0]);
+            let got: Vec<_> = dk[n * k..][..k].iter().copied().zip(ik[n * k..][..k].iter().copied()).collect();
+            assert_eq!(got, all[..k]);
+            let got: Vec<_> = within[n].distance_mm.iter().copied().zip(within[n].index.iter().copied()).collect();
+            let expected: Vec<_> = all.into_iter().filter(|x| x.0 <= r).collect();
+            assert_eq!(got, expected);
+        }
+    }
+
+    fn random(n: usize, seed: u64, size: f64, offset: f64) -> Vec<[f64; 3]> {
+        let mut state = seed;
+        let mut next = || {
+            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            (state >> 11) as f64 / (1u64 << 53) as f64 * size + offset
+        };
+        (0..n).map(|_| [next(), next(), next()]).collect()
+    }
+
+    #[test]
+    fn random_clouds_of_any_size_near_and_far_from_the_origin() {
+        for n in [1, 2, 7, 8, 9, 63, 64, 65, 513, 4097] {
+            for offset in [0.0, 1e6] {
+                agrees(&random(n, 1, 100.0, offset), &random(50, 2, 120.0, offset - 10.0), 11, 9.0);
+            }
+        }
+    }
+
+    #[test]
+    fn lattices_duplicates_and_lines_go_to_the_lowest_index() {
+        let lattice: Vec<[f64; 3]> =
+            (0..1000).map(|i| [f64::from(i % 10), f64::from(i / 10 % 10), f64::from(i / 100)]).collect();
+        let between: Vec<[f64; 3]> = lattice.iter().map(|p| p.map(|c| c + 0.5)).collect();
+        agrees(&lattice, &between, 9, 1.0);
+        agrees(&lattice, &lattice, 7, 1.0);
+        agrees(&vec![[1.0, 2.0, 3.0]; 300], &[[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]], 300, 0.0);
+        let line: Vec<[f64; 3]> = (0..500).map(|i| [f64::from(i % 250), 0.0, 0.0]).collect();
+        agrees(&line, &between[..200], 5, 3.0);
+    }
+
+    #[test]
+    fn kiddo_finds_the_same_distances() {
+        let points = random(20_000, 5, 50.0, 1000.0);
+        let queries = random(2_000, 6, 50.0, 1000.0);
+        let theirs = kiddo::ImmutableKdTree::<f64, 3>::new_from_slice(&points).unwrap();
+        let (ours, _) = KdTree::new(&points).unwrap().nearest(&queries).unwrap();
+        for (q, d) in queries.iter().zip(ours) {
+            let their = theirs.query(q).nearest_one::<kiddo::SquaredEuclidean<f64>>().execute();
+            assert!((their.distance.sqrt() - d).abs() <= 4.0 * f64::EPSILON * d);
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn coarse_coordinates_make_ties(
+            points in prop::collection::vec(prop::array::uniform3(-4i32..4), 1..200),
+            queries in prop::collection::vec(prop::array::uniform3(-5i32..5), 0..20),
+            k in 1usize..12,
+            r in 0u32..6,
+        ) {
+            let float = |v: Vec<[i32; 3]>| -> Vec<[f64; 3]> { v.into_iter().map(|p| p.map(f64::from)).collect() };
+            agrees(&float(points), &float(queries), k, f64::from(r));
+        }
+    }
+
+    #[test]
+    fn any_number_of_threads_gives_the_same_answer() {
+        let (points, queries) = (random(100_000, 3, 10.0, 0.0), random(5_000, 4, 10.0, 0.0));
+        let answers: Vec<_> = [1, 2, 8]
+            .iter()
+            .map(|&n| {
+                threads::set_threads(Some(n)).unwrap();
+                KdTree::new(&points).unwrap().knn(&queries, 5).unwrap()
+            })
+            .collect();
+        threads::set_threads(None).unwrap();
+        assert!(answers.windows(2).all(|w| w[0] == w[1]));
+    }
+
+    #[test]
+    fn it_takes_at_most_40_bytes_a_point() {
+        for n in [10_000, 100_000, 300_000] {
+            assert!(KdTree::new(&random(n, 9, 1.0, 0.0)).unwrap().bytes() <= 40 * n);
+        }
+    }
+
+    #[test]
+    fn what_has_no_answer_is_refused() {
+        assert!(matches!(KdTree::new(&[]), Err(Error::TooFew { .. })));
+        assert!(matches!(KdTree::new(&[[0.0, f64::NAN, 0.0]]), Err(Error::NonFinite { .. })));
+        assert!(matches!(KdTree::new(&[[0.0, 1e200, 0.0]]), Err(Error::OutOfRange { .. })));
+        let tree = KdTree::new(&[[0.0; 3]]).unwrap();
+        assert!(matches!(tree.nearest(&[[f64::INFINITY, 0.0, 0.0]]), Err(Error::NonFinite { .. })));
+        assert!(matches!(tree.knn(&[[0.0; 3]], 2), Err(Error::OutOfRange { .. })));
+        assert!(matches!(tree.knn(&[[0.0; 3]], 0), Err(Error::OutOfRange { .. })));
+        assert!(tree.radius(&[[0.0; 3]], -1.0).is_err() && tree.radius(&[[0.0; 3]], f64::NAN).is_err());
+        assert_eq!(tree.radius(&[[1.0; 3]], f64::INFINITY).unwrap()[0].index, [0]);
+        assert!(tree.nearest(&[]).unwrap().0.is_empty());
+    }
+}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from weldscan._weldcore import Lens, Scanner, __version__, set_threads
+from weldscan._weldcore import KdTree, Lens, RigidFit, Scanner, __version__, register_rigid, set_threads
 from weldscan.errors import DeviceError, DeviceTimeout, GeometryError, InputError, NotMeasured, WeldscanError
 from weldscan.pose import (
     KukaPose,
@@ -41,9 +41,11 @@ __all__ = [
     "DeviceTimeout",
     "GeometryError",
     "InputError",
+    "KdTree",
     "KukaPose",
     "Lens",
     "NotMeasured",
+    "RigidFit",
     "Scanner",
     "Session",
     "WeldscanError",
@@ -59,6 +61,7 @@ __all__ = [
     "parse_frame",
     "read_frames",
     "read_session",
+    "register_rigid",
     "set_threads",
     "write_session",
 ]

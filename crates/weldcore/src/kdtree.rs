@@ -256,13 +256,6 @@ impl KdTree {
         }
         self.offer_leaf(node, q, found);
     }
-
-    /// The point in a place of the tree's own order.
-    #[inline(always)]
-    fn in_place(&self, place: u32) -> [f64; 3] {
-        let (leaf, i) = (place as usize / WIDTH, place as usize % WIDTH);
-        self.leaves[leaf].0.map(|row| row[i])
-    }
 }
 
 impl std::fmt::Debug for KdTree {

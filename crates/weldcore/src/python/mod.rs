@@ -7,7 +7,9 @@ use numpy::{PyArray, PyArrayMethods, PyReadonlyArray, PyReadonlyArray2, PyUntype
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
+mod kdtree;
 mod scanner;
+mod transform;
 
 use crate::error::Error;
 use crate::transform::Transform;
@@ -108,5 +110,7 @@ fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("__version__", env!("CARGO_PKG_VERSION"))?;
     m.add_function(wrap_pyfunction!(set_threads, m)?)?;
     scanner::register(m)?;
+    kdtree::register(m)?;
+    transform::register(m)?;
     Ok(())
 }

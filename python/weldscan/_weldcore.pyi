@@ -4,7 +4,16 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__: list[str]
+__all__ = [
+    "KdTree",
+    "Lens",
+    "RigidFit",
+    "Scanner",
+    "__version__",
+    "register_rigid",
+    "set_threads",
+]
+
 __version__: str
 
 def set_threads(threads: int | None = None) -> None: ...

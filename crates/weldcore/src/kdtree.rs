@@ -390,7 +390,7 @@ fn nearest_k_of(tree: &KdTree, queries: &[[f64; 3]], k: usize, distance: &mut [f
 fn within_of(tree: &KdTree, queries: &[[f64; 3]], r: f64) -> Vec<Within> {
     let mut aside = Aside::new();
     // Wide enough for the rounding of the square and of the root that decides.
-    let bound = (r * r * (1.0 + 4.0 * f64::EPSILON)).min(FAR).max(f64::MIN_POSITIVE);
+    let bound = (r * r * (1.0 + 4.0 * f64::EPSILON)).clamp(f64::MIN_POSITIVE, FAR);
     let mut found = WithinRadius { bound, r, all: Vec::new() };
     let mut answers = Vec::with_capacity(queries.len());
     for q in queries {

@@ -20,10 +20,12 @@ from weldscan.pose import (
 )
 
 if TYPE_CHECKING:
+    from weldscan.norms import judge, limit_mm, norm_ids
     from weldscan.session import Session, iter_frames, read_frames, read_session, write_session
 
 # The faces are imported when they are asked for: they bring pydantic and OpenCV, which an algorithm does not need.
 _LAZY = {
+    "weldscan.norms": ("judge", "limit_mm", "norm_ids"),
     "weldscan.session": ("Session", "iter_frames", "read_frames", "read_session", "write_session"),
 }
 
@@ -54,8 +56,11 @@ __all__ = [
     "format_e6pos",
     "format_frame",
     "iter_frames",
+    "judge",
     "kuka_from_matrix",
+    "limit_mm",
     "matrix_from_kuka",
+    "norm_ids",
     "parse_e6axis",
     "parse_e6pos",
     "parse_frame",

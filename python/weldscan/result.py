@@ -179,3 +179,10 @@ class Inspection:
         if self.method == "paper":
             return None if self.step.histogram is None else self.step.histogram.step_mm
         return self.step.max_abs_mm
+
+    @property
+    def verdict(self) -> Verdict:
+        """The one answer where several norms were asked: the worst of theirs; what is not known is worse than close."""
+        order = (Verdict.FAIL, Verdict.NOT_MEASURED, Verdict.NOT_ASSESSABLE, Verdict.INCONCLUSIVE, Verdict.PASS)
+        given = {judgement.verdict for judgement in self.verdicts}
+        return next((verdict for verdict in order if verdict in given), Verdict.NOT_MEASURED)

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
+from weldscan._weldcore import Lens, Scanner
 from weldscan.errors import InputError
 
 Image: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
@@ -133,6 +134,11 @@ class ScannerSpec(_Model):
     camera: LensSpec
     projector: LensSpec
     camera_from_projector: Rigid
+
+    def build(self) -> Scanner:
+        """The core's scanner of these numbers."""
+        camera, projector = (Lens(lens.width, lens.height, lens.K, lens.dist) for lens in (self.camera, self.projector))
+        return Scanner(camera, projector, self.camera_from_projector)
 
     @model_validator(mode="after")
     def _has_a_baseline(self) -> Self:
@@ -375,6 +381,10 @@ def read_session(folder: str | os.PathLike[str]) -> Session:
         if Path(name).is_absolute() or folder.resolve() not in inside.parents:
             raise InputError(f"{path}: hand_eye: {name!r} is not a file inside the session's folder")
         session = session.model_copy(update={"hand_eye": read_hand_eye(folder / name)})
+    try:
+        session.scanner.build()
+    except InputError as error:
+        raise InputError(f"{path}: scanner: {error}") from None
     session._folder = folder
     return session
 

@@ -5,7 +5,18 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from weldscan._weldcore import KdTree, Lens, RigidFit, Scanner, __version__, register_rigid, set_threads
+from weldscan._weldcore import (
+    KdTree,
+    Lens,
+    RigidFit,
+    Scanner,
+    SimulatedShot,
+    __version__,
+    register_rigid,
+    set_threads,
+    simulate_shot,
+    simulated_step,
+)
 from weldscan.errors import DeviceError, DeviceTimeout, GeometryError, InputError, NotMeasured, WeldscanError
 from weldscan.pose import (
     KukaPose,
@@ -50,6 +61,7 @@ __all__ = [
     "RigidFit",
     "Scanner",
     "Session",
+    "SimulatedShot",
     "WeldscanError",
     "__version__",
     "format_e6axis",
@@ -68,5 +80,7 @@ __all__ = [
     "read_session",
     "register_rigid",
     "set_threads",
+    "simulate_shot",
+    "simulated_step",
     "write_session",
 ]

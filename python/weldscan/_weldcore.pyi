@@ -1,5 +1,6 @@
 # The Rust core as Python sees it. One section per room, in the order of the flow.
-from typing import final
+from collections.abc import Sequence
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -65,3 +66,35 @@ class RigidFit:
     def rms_mm(self) -> float: ...
 
 def register_rigid(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> RigidFit: ...
+
+# simulate
+@final
+class SimulatedShot:
+    @property
+    def white(self) -> list[NDArray[np.uint8] | NDArray[np.uint16]]: ...
+    @property
+    def frames(self) -> list[list[NDArray[np.uint8] | NDArray[np.uint16]]]: ...
+    @property
+    def points_mm(self) -> NDArray[np.float64]: ...
+    @property
+    def column_px(self) -> NDArray[np.float64]: ...
+    @property
+    def row_px(self) -> NDArray[np.float64]: ...
+    @property
+    def deviation_mm(self) -> NDArray[np.float64]: ...
+    @property
+    def along(self) -> NDArray[np.float64]: ...
+    @property
+    def labels(self) -> NDArray[np.uint8]: ...
+
+def simulate_shot(
+    scanner: Scanner,
+    scene_from_scanner: ArrayLike,
+    bodies: Sequence[Any],
+    fringes: Sequence[tuple[str, float, int]],
+    photometry: Any,
+    *,
+    exposures: Sequence[float] = ...,
+    seed: int = 0,
+) -> SimulatedShot: ...
+def simulated_step(weld: Any, along: NDArray[np.float64]) -> NDArray[np.float64]: ...

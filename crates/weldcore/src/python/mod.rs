@@ -9,6 +9,7 @@ use pyo3::types::PyDict;
 
 mod kdtree;
 mod scanner;
+mod simulate;
 mod transform;
 
 use crate::error::Error;
@@ -112,5 +113,6 @@ fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
     scanner::register(m)?;
     kdtree::register(m)?;
     transform::register(m)?;
+    simulate::register(m)?;
     Ok(())
 }

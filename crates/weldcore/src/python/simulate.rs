@@ -1,0 +1,301 @@
+//! The simulator as Python sees it. Bodies are read by attribute: any object that has them will do.
+
+use std::sync::Arc;
+
+use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1};
+use pyo3::exceptions::PyTypeError;
+use pyo3::prelude::*;
+
+use super::scanner::PyScanner;
+use super::{compute, float_matrix, raise, transform};
+use crate::error::Error;
+use crate::scanner::Rays;
+use crate::simulate::{Axis, Bead, Body, Frames, FringeSet, Photometry, Sample, Shape, Surface, Wall, Weld, simulate};
+use crate::transform::Transform;
+
+#[derive(FromPyObject)]
+struct PyWall {
+    radius_mm: f64,
+    offset_mm: [f64; 2],
+    tilt_rad: [f64; 2],
+    ovality_mm: f64,
+    ovality_at_rad: f64,
+    waviness_mm: f64,
+}
+
+#[derive(FromPyObject)]
+struct PyBead {
+    width_mm: f64,
+    height_mm: f64,
+    ripple_mm: f64,
+    pitch_mm: f64,
+    wander_mm: f64,
+}
+
+#[derive(FromPyObject)]
+struct PyWeld {
+    reference: PyWall,
+    other: PyWall,
+    bead: PyBead,
+    length_mm: f64,
+}
+
+#[derive(FromPyObject)]
+struct PySurface {
+    albedo: f64,
+    specular: f64,
+    shininess: f64,
+    brushed: f64,
+}
+
+#[derive(FromPyObject)]
+struct PyPhotometry {
+    lamp: f64,
+    distance_mm: f64,
+    ambient: f64,
+    black: f64,
+    gamma: f64,
+    blur_px: f64,
+    full_well_e: f64,
+    read_noise_e: f64,
+    bits: u32,
+}
+
+fn weld(py: Python<'_>, w: PyWeld) -> PyResult<Weld> {
+    let wall = |w: PyWall| Wall {
+        radius_mm: w.radius_mm,
+        offset_mm: w.offset_mm,
+        tilt_rad: w.tilt_rad,
+        ovality_mm: w.ovality_mm,
+        ovality_at_rad: w.ovality_at_rad,
+        waviness_mm: w.waviness_mm,
+    };
+    let b = w.bead;
+    let bead = Bead {
+        width_mm: b.width_mm,
+        height_mm: b.height_mm,
+        ripple_mm: b.ripple_mm,
+        pitch_mm: b.pitch_mm,
+        wander_mm: b.wander_mm,
+    };
+    Weld::new(wall(w.reference), wall(w.other), bead, w.length_mm).map_err(|e| raise(py, &e))
+}
+
+fn shape(object: &Bound<'_, PyAny>) -> PyResult<Shape> {
+    let attribute = |name: &str| object.getattr(name);
+    let kind = object.get_type().name()?.to_string();
+    Ok(match kind.as_str() {
+        "Sphere" => Shape::Sphere { radius_mm: attribute("radius_mm")?.extract()? },
+        "Block" => Shape::Block {
+            size_mm: attribute("size_mm")?.extract()?,
+            squares: attribute("squares")?.extract()?,
+            square_mm: attribute("square_mm")?.extract()?,
+        },
+        "Stem" => {
+            Shape::Stem { radius_mm: attribute("radius_mm")?.extract()?, length_mm: attribute("length_mm")?.extract()? }
+        }
+        "Weld" => Shape::Weld(Box::new(weld(object.py(), object.extract()?)?)),
+        _ => return Err(PyTypeError::new_err(format!("bodies: no shape is called {kind}"))),
+    })
+}
+
+fn body(object: &Bound<'_, PyAny>) -> PyResult<Body> {
+    let place = float_matrix("scene_from_body", &object.getattr("scene_from_body")?)?;
+    let s: PySurface = object.getattr("surface")?.extract()?;
+    Ok(Body {
+        shape: shape(&object.getattr("shape")?)?,
+        scene_from_body: transform("scene_from_body", &place)?,
+        surface: Surface { albedo: s.albedo, specular: s.specular, shininess: s.shininess, brushed: s.brushed },
+        label: object.getattr("label")?.extract()?,
+    })
+}
+
+/// One simulated shot: its images, and what each pixel's centre saw.
+#[pyclass(frozen, module = "weldscan", name = "SimulatedShot")]
+pub(crate) struct PyShot {
+    height: usize,
+    width: usize,
+    samples: Vec<Sample>,
+    rays: Arc<Rays>,
+    /// Per exposure the image under even light, (H, W) uint8 or uint16.
+    #[pyo3(get)]
+    white: Vec<Py<PyAny>>,
+    /// Exposures of frames: `frames[e][i]` is frame i, in the order of the fringes and their steps.
+    #[pyo3(get)]
+    frames: Vec<Vec<Py<PyAny>>>,
+}
+
+impl PyShot {
+    fn image<'py>(&self, py: Python<'py>, value: impl Fn(&Sample) -> f64) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let flat: Vec<f64> = self.samples.iter().map(value).collect();
+        flat.into_pyarray(py).reshape([self.height, self.width])
+    }
+}
+
+#[pymethods]
+impl PyShot {
+    /// The point that each pixel sees, (H, W, 3) float64, scanner's frame, mm; NaN for the background.
+    #[getter]
+    fn points_mm<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f64>>> {
+        let rays = self.rays.x.iter().zip(&self.rays.y);
+        let points = self.samples.iter().zip(rays);
+        let flat: Vec<f64> = points.flat_map(|(s, (x, y))| [x * s.depth_mm, y * s.depth_mm, s.depth_mm]).collect();
+        flat.into_pyarray(py).reshape([self.height, self.width, 3])
+    }
+
+    /// The projector column that lights each pixel, (H, W) float64, px; NaN in the dark.
+    #[getter]
+    fn column_px<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        self.image(py, |s| s.column_px)
+    }
+
+    /// The projector row that lights each pixel, (H, W) float64, px; NaN in the dark.
+    #[getter]
+    fn row_px<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        self.image(py, |s| s.row_px)
+    }
+
+    /// Height of lit points of the other wall over the reference wall, (H, W) float64, mm; NaN elsewhere.
+    #[getter]
+    fn deviation_mm<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        self.image(py, |s| s.deviation_mm)
+    }
+
+    /// Angle about the axis of lit points of both walls, (H, W) float64, rad (plates: place along the seam, mm).
+    #[getter]
+    fn along<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        self.image(py, |s| s.along)
+    }
+
+    /// What each pixel sees, (H, W) uint8: the bodies' labels, 0 for the background.
+    #[getter]
+    fn labels<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<u8>>> {
+        let flat: Vec<u8> = self.samples.iter().map(|s| s.label).collect();
+        flat.into_pyarray(py).reshape([self.height, self.width])
+    }
+
+    fn __repr__(&self) -> String {
+        let frames = self.frames.iter().map(Vec::len).sum::<usize>();
+        format!("SimulatedShot({frames} frames of {}x{} px)", self.width, self.height)
+    }
+}
+
+/// Renders the fringe images of one shot of an analytic scene, with their truth.
+///
+/// Args:
+///     scanner: `Scanner`.
+///     scene_from_scanner: (4, 4), where the scanner (its camera) stands in the scene, mm.
+///     bodies: what stands in the scene: `weldscan.devices.simulated.Body`.
+///     fringes: sets of (axis "x" or "y", periods, steps).
+///     photometry: lamp, room, projector and sensor: `weldscan.devices.simulated.Photometry`.
+///     exposures: factors on the light, one stack of frames each.
+///     seed: start of the random numbers.
+///
+/// Returns:
+///     `SimulatedShot`: `white`, `frames`, and per pixel `points_mm`, `column_px`, `row_px`, `labels`, `deviation_mm`.
+///
+/// Raises:
+///     InputError: a parameter is out of its range; the message names it.
+///
+/// Example:
+///     >>> import numpy as np
+///     >>> from weldscan import simulate_shot
+///     >>> from weldscan.devices.simulated import DEFAULT, Body, Photometry, Sphere
+///     >>> ball = np.eye(4)
+///     >>> ball[2, 3] = 420.0
+///     >>> shot = simulate_shot(DEFAULT.scanner, np.eye(4), [Body(Sphere(10.0), ball)], [("x", 8, 4)], Photometry())
+///     >>> float(round(np.nanmin(shot.points_mm[..., 2]), 3))
+///     410.0
+#[pyfunction]
+#[pyo3(signature = (scanner, scene_from_scanner, bodies, fringes, photometry, *, exposures=vec![1.0], seed=0))]
+#[allow(clippy::too_many_arguments)] // They are what a shot depends on.
+fn simulate_shot(
+    scanner: &Bound<'_, PyScanner>,
+    scene_from_scanner: &Bound<'_, PyAny>,
+    bodies: Vec<Bound<'_, PyAny>>,
+    fringes: Vec<(String, f64, usize)>,
+    photometry: PyPhotometry,
+    exposures: Vec<f64>,
+    seed: u64,
+) -> PyResult<PyShot> {
+    let py = scanner.py();
+    let pose: Transform = transform("scene_from_scanner", &float_matrix("scene_from_scanner", scene_from_scanner)?)?;
+    let bodies = bodies.iter().map(body).collect::<PyResult<Vec<_>>>()?;
+    let axis = |name: &str| match name {
+        "x" => Ok(Axis::X),
+        "y" => Ok(Axis::Y),
+        _ => {
+            let value = name.to_string();
+            Err(raise(py, &Error::OutOfRange { what: "fringe axis", expected: "\"x\" or \"y\"".into(), value }))
+        }
+    };
+    let fringes = fringes
+        .into_iter()
+        .map(|(name, periods, steps)| Ok(FringeSet { axis: axis(&name)?, periods, steps }))
+        .collect::<PyResult<Vec<_>>>()?;
+    let p = photometry;
+    let photometry = Photometry {
+        lamp: p.lamp,
+        distance_mm: p.distance_mm,
+        ambient: p.ambient,
+        black: p.black,
+        gamma: p.gamma,
+        blur_px: p.blur_px,
+        full_well_e: p.full_well_e,
+        read_noise_e: p.read_noise_e,
+        bits: p.bits,
+        seed,
+    };
+    let scanner = &scanner.get().scanner;
+    let (shot, rays) = compute(py, || {
+        let shot = simulate(scanner, &pose, &bodies, &fringes, &exposures, &photometry)?;
+        Ok((shot, scanner.camera_rays()))
+    })?;
+    let (height, width) = (scanner.camera.height, scanner.camera.width);
+    let mut images = match shot.frames {
+        Frames::Eight(frames) => frames.into_iter().map(|f| array(py, f, height, width)).collect::<PyResult<Vec<_>>>(),
+        Frames::Sixteen(frames) => frames.into_iter().map(|f| array(py, f, height, width)).collect(),
+    }?
+    .into_iter();
+    let steps = fringes.iter().map(|f| f.steps).sum();
+    let stack = |_| (images.next(), images.by_ref().take(steps).collect());
+    let (white, frames): (Vec<Option<_>>, Vec<_>) = exposures.iter().map(stack).unzip();
+    Ok(PyShot { height, width, samples: shot.samples, rays, white: white.into_iter().flatten().collect(), frames })
+}
+
+fn array<T: numpy::Element>(py: Python<'_>, flat: Vec<T>, height: usize, width: usize) -> PyResult<Py<PyAny>> {
+    Ok(flat.into_pyarray(py).reshape([height, width])?.into_any().unbind())
+}
+
+/// The true step of a simulated weld at the seam: other wall minus reference wall along the radius, waviness left out.
+///
+/// Args:
+///     weld: `weldscan.devices.simulated.Weld`.
+///     along: (n,) angles about the axis, rad; for plates places along the seam, mm.
+///
+/// Returns:
+///     (n,) float64, mm; positive where the other wall stands further out.
+///
+/// Example:
+///     >>> import numpy as np
+///     >>> from weldscan import simulated_step
+///     >>> from weldscan.devices.simulated import Bead, Wall, Weld
+///     >>> weld = Weld(Wall(315.0), Wall(315.0, offset_mm=(0.5, 0.0)), Bead())
+///     >>> simulated_step(weld, np.array([0.0, np.pi])).round(6)
+///     array([ 0.5, -0.5])
+#[pyfunction]
+fn simulated_step<'py>(
+    weld: &Bound<'py, PyAny>,
+    along: PyReadonlyArray1<'py, f64>,
+) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    let py = weld.py();
+    let weld = self::weld(py, weld.extract()?)?;
+    let steps: Vec<f64> = along.as_array().iter().map(|&a| weld.step_at_seam(a)).collect();
+    Ok(steps.into_pyarray(py))
+}
+
+pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_class::<PyShot>()?;
+    m.add_function(wrap_pyfunction!(simulate_shot, m)?)?;
+    m.add_function(wrap_pyfunction!(simulated_step, m)?)
+}

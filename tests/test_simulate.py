@@ -2,39 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import math
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
-from weldscan import InputError, Lens, Scanner, set_threads, simulate_shot, simulated_step
+from weldscan import Lens, Scanner
 from weldscan.devices.simulated import (
-    BEAD,
     DEFAULT,
-    NO_BEAD,
-    OTHER_WALL,
-    REFERENCE_WALL,
-    SPHERE,
-    Bead,
-    Block,
-    Body,
     Cell,
     Photometry,
-    Sphere,
-    Stem,
-    Surface,
-    Wall,
-    Weld,
-    look_at,
-    make_scanner,
     pipe,
-    placed,
-    plates,
     render,
-    simulate_session,
 )
 
 # Rays are solved to 1e-8 mm and pixels pass through a lens solved to 1e-12: what is left is rounding.

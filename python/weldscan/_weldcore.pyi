@@ -10,9 +10,12 @@ __all__ = [
     "Lens",
     "RigidFit",
     "Scanner",
+    "SimulatedShot",
     "__version__",
     "register_rigid",
     "set_threads",
+    "simulate_shot",
+    "simulated_step",
 ]
 
 __version__: str

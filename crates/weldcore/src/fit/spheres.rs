@@ -1,0 +1,695 @@
+//! Spheres of a known size, found in a raw cloud without any other hint.
+//!
+//! The cloud is cut into cells an eighth of the radius wide: tiles of a pixel grid, or voxels. Each cell has a normal and
+//! votes for the centre at one radius along it, on either side. Where votes meet, a sphere of fixed radius is fitted,
+//! first to the cells, then to the points. A place is refused unless it looks like a sphere of that size in every respect:
+//! its surroundings lie on it, enough of the cap is seen, the noise leaves its shape visible, and the radius, set free,
+//! comes out right within its own uncertainty.
+
+use std::collections::HashMap;
+use std::hash::{BuildHasherDefault, Hasher};
+
+use nalgebra::{Matrix3, Matrix4, Vector4};
+use rayon::prelude::*;
+
+use super::sphere::{self, Sphere};
+use super::{Noise, principal};
+use crate::Vec3;
+use crate::error::{Error, Result, require_finite, require_positive};
+use crate::threads;
+
+/// The cap that counts: half-angle about the line of sight. Beyond it light falls and is seen too obliquely; the same
+/// 120° cone in which ASTM E3125 evaluates scanned spheres.
+pub const CAP_RAD: f64 = 60.0 * std::f64::consts::PI / 180.0;
+/// Points further from the sphere than this many standard deviations are not on it.
+const GATE: f64 = 3.0;
+/// Points within this part of the radius from the surface are its surroundings.
+const ZONE: f64 = 0.2;
+/// Least share of the surroundings that lies on the sphere. A cylinder of the same radius reaches 0.3.
+const PURITY: f64 = 0.6;
+/// Least solid angle seen, in parts of a hemisphere; the whole cap is 0.5. A cylinder of the same radius reaches 0.1.
+const COVERAGE: f64 = 0.15;
+/// Noise that leaves the shape visible: the cap is R/2 deep.
+const NOISE: f64 = 0.03;
+/// A scanner's scale may be off by this much beyond what the noise of the free radius allows.
+const SCALE: f64 = 0.005;
+/// Coverage factor of the free radius.
+const SIGMAS: f64 = 4.0;
+/// Places looked at before the search gives up; votes of a cylinder of the same radius meet all along its axis.
+const MAX_PLACES: usize = 256;
+
+/// A sphere found in a cloud.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Found {
+    /// Its centre, and the radius that was given.
+    pub sphere: Sphere,
+    /// Covariance of the centre, mm²: from the residuals, and enlarged where neighbouring residuals go together.
+    pub covariance: Matrix3<f64>,
+    /// Root mean square of the inliers' distances from the sphere, mm.
+    pub rms_mm: f64,
+    /// Indices of the points on it, ascending.
+    pub inliers: Vec<usize>,
+    /// Solid angle seen, in parts of a hemisphere (0.5 is the whole 120° cap).
+    pub coverage: f64,
+    /// The radius that the same points have when it is set free, mm.
+    pub free_radius_mm: f64,
+    /// Standard uncertainty of the free radius, mm.
+    pub free_radius_sigma_mm: f64,
+}
+
+/// Finds the spheres of radius `radius_mm` in a cloud.
+///
+/// `width` is that of a pixel grid (row by row, NaN where a pixel has no point); without it the cloud is bare and all of it
+/// must be finite. With `count` the best `count` are returned, or an error that says why there are not so many.
+/// The order is that of the number of inliers, most first.
+///
+/// # Errors
+/// Bad values; [`Error::NotFound`] where fewer than `count` are there.
+pub fn find(points: &[[f64; 3]], width: Option<usize>, radius_mm: f64, count: Option<usize>) -> Result<Vec<Found>> {
+    require_positive("radius_mm", radius_mm)?;
+    if count == Some(0) {
+        return Err(Error::OutOfRange { what: "count", expected: "at least 1".into(), value: "0".into() });
+    }
+    let cloud = match width {
+        Some(width) => Cloud::of_grid(points, width, radius_mm)?,
+        None => {
+            require_finite("points", points)?;
+            Cloud::of_bare(points, radius_mm)
+        }
+    };
+    let (mut found, refused) = cloud.search(radius_mm);
+    found.sort_by(|a, b| b.inliers.len().cmp(&a.inliers.len()).then(a.inliers.cmp(&b.inliers)));
+    if let Some(count) = count {
+        if found.len() < count {
+            let mut reason = format!("{} of {count} spheres of radius {radius_mm} mm seen", found.len());
+            for (place, why) in refused.iter().take(5) {
+                reason += &format!("; at ({:.1}, {:.1}, {:.1}) {why}", place[0], place[1], place[2]);
+            }
+            return Err(Error::NotFound { what: "sphere", reason });
+        }
+        found.truncate(count);
+    }
+    Ok(found)
+}
+
+/// A small patch of the cloud.
+#[derive(Debug, Clone, Copy, Default)]
+struct Cell {
+    points: usize,
+    mean: Vec3,
+    /// Unit normal; zero where there is none. On a grid its sign is that of the camera's side.
+    normal: Vec3,
+    /// Mean column and row.
+    pixel: [f64; 2],
+}
+
+enum Layout {
+    Grid { width: usize, tile: usize, columns: usize },
+    Bare { order: Vec<usize>, starts: Vec<usize> },
+}
+
+struct Cloud<'a> {
+    points: &'a [[f64; 3]],
+    layout: Layout,
+    cells: Vec<Cell>,
+}
+
+fn finite(p: &[f64; 3]) -> bool {
+    (p[0] + p[1] + p[2]).is_finite()
+}
+
+impl<'a> Cloud<'a> {
+    fn of_grid(points: &'a [[f64; 3]], width: usize, radius: f64) -> Result<Self> {
+        if width == 0 || !points.len().is_multiple_of(width) {
+            let got = format!("{} points", points.len());
+            return Err(Error::Shape { what: "points", expected: format!("rows of {width} pixels"), got });
+        }
+        let tile = tile_size(points, width, radius);
+        let columns = width.div_ceil(tile);
+        let rows: Vec<std::result::Result<Vec<Cell>, usize>> = threads::install(|| {
+            points.par_chunks(width * tile).enumerate().map(|(r, band)| band_cells(band, width, tile, r)).collect()
+        });
+        let mut cells = Vec::with_capacity(rows.len() * columns);
+        for row in rows {
+            cells.extend(row.map_err(|index| Error::NonFinite { what: "points", index })?);
+        }
+        Ok(Self { points, layout: Layout::Grid { width, tile, columns }, cells })
+    }
+
+    fn of_bare(points: &'a [[f64; 3]], radius: f64) -> Self {
+        // Normals need about this many points.
+        const ENOUGH: usize = 12;
+        let mut size = radius / 8.0;
+        loop {
+            let voxels = Voxels::of(points, size);
+            let merged: Vec<Sums> = threads::install(|| (0..voxels.keys.len()).into_par_iter().map(|i| voxels.merged(i)).collect());
+            let mut counts: Vec<usize> = merged.iter().map(|m| m.n as usize).collect();
+            let middle = counts.len() / 2;
+            let typical = if counts.is_empty() { 0 } else { *counts.select_nth_unstable(middle).1 };
+            if typical < ENOUGH && size < radius / 3.0 && !counts.is_empty() {
+                size *= 1.3;
+                continue;
+            }
+            let cell = |i: usize| {
+                let m = &merged[i];
+                let (mean, normal) = m.plane();
+                let offset = Vec3::from_fn(|k, _| voxels.origin[k] + (voxels.keys[i][k] as f64 + 0.5) * size);
+                Cell { points: voxels.sums[i].n as usize, mean: mean * size + offset, normal, pixel: [0.0; 2] }
+            };
+            let cells = threads::install(|| (0..merged.len()).into_par_iter().map(cell).collect());
+            return Self { points, layout: Layout::Bare { order: voxels.order, starts: voxels.starts }, cells };
+        }
+    }
+
+    /// Calls `job` with the index of every point of a cell.
+    fn members(&self, cell: usize, mut job: impl FnMut(usize)) {
+        match &self.layout {
+            Layout::Grid { width, tile, columns } => {
+                let (row, column) = (cell / columns * tile, cell % columns * tile);
+                for r in row..(row + tile).min(self.points.len() / width) {
+                    for c in column..(column + tile).min(*width) {
+                        job(r * width + c);
+                    }
+                }
+            }
+            Layout::Bare { order, starts } => {
+                let end = starts.get(cell + 1).copied().unwrap_or(order.len());
+                order.get(starts[cell]..end).unwrap_or_default().iter().for_each(|&i| job(i));
+            }
+        }
+    }
+
+    fn search(&self, radius: f64) -> (Vec<Found>, Vec<(Vec3, String)>) {
+        let votes = Votes::of(&self.cells, radius);
+        let (mut found, mut refused): (Vec<Found>, Vec<(Vec3, String)>) = (Vec::new(), Vec::new());
+        let mut looked: Vec<Vec3> = Vec::new();
+        for peak in votes.peaks() {
+            if looked.len() >= MAX_PLACES {
+                break;
+            }
+            let place = votes.settle(peak);
+            // Two spheres cannot share space; and a place that was refused is not worth another look close by.
+            let taken = found.iter().any(|f| (f.sphere.center_mm - place).norm() < radius);
+            if taken || looked.iter().any(|p| (p - place).norm() < 0.3 * radius) {
+                continue;
+            }
+            looked.push(place);
+            match self.examine(place, radius) {
+                Ok(f) if found.iter().any(|g| (g.sphere.center_mm - f.sphere.center_mm).norm() < radius) => {}
+                Ok(f) => found.push(f),
+                Err(reason) => refused.push((place, reason)),
+            }
+        }
+        refused.retain(|(p, _)| found.iter().all(|f| (f.sphere.center_mm - p).norm() > 1.5 * radius));
+        (found, refused)
+    }
+
+    /// Fits a sphere near `place`, or says why there is none.
+    fn examine(&self, place: Vec3, radius: f64) -> std::result::Result<Found, String> {
+        let mut center = self.settle_on_cells(place, radius)?;
+        let sight = self.line_of_sight(center, radius);
+        let limit = CAP_RAD.cos();
+        // All points that could be on it, with the cell they belong to.
+        let mut near: Vec<(usize, usize)> = Vec::new();
+        for (k, cell) in self.cells.iter().enumerate() {
+            if cell.points > 0 && ((cell.mean - center).norm() - radius).abs() < 0.5 * radius {
+                self.members(k, |i| {
+                    if finite(&self.points[i]) {
+                        near.push((i, k));
+                    }
+                });
+            }
+        }
+        let mut sigma = 0.0;
+        let mut zone: Vec<(usize, usize, f64)> = Vec::new();
+        // Each round measures the noise, gates, fits; ten rounds settle or never will.
+        for _ in 0..20 {
+            zone.clear();
+            for &(i, k) in &near {
+                let d = Vec3::from(self.points[i]) - center;
+                let r = d.norm();
+                if (r - radius).abs() < ZONE * radius && sight.is_none_or(|v| d.dot(&v) >= limit * r) {
+                    zone.push((i, k, r - radius));
+                }
+            }
+            if zone.len() < 8 {
+                return Err(format!("only {} points", zone.len()));
+            }
+            let mut sizes: Vec<f64> = zone.iter().map(|z| z.2.abs()).collect();
+            let middle = sizes.len() / 2;
+            // The median of |residual| of a normal distribution is 0.6745 sigma.
+            sigma = *sizes.select_nth_unstable_by(middle, f64::total_cmp).1 / 0.6745;
+            let gate = self.gate(sigma, center);
+            let on: Vec<[f64; 3]> =
+                zone.iter().filter(|z| z.2.abs() <= gate).map(|z| self.points[z.0]).collect();
+            let step = fixed_step(&on, center, radius).ok_or("the points do not determine a sphere")?;
+            center += step;
+            if step.norm() < 1e-9 * radius {
+                break;
+            }
+            if (center - place).norm() > radius {
+                return Err("the points lead away from it".into());
+            }
+        }
+        if sigma > NOISE * radius {
+            return Err(format!("its surroundings scatter by {sigma:.3} mm: not a sphere of radius {radius} mm"));
+        }
+        let gate = self.gate(sigma, center);
+        let on: Vec<(usize, usize)> = zone.iter().filter(|z| z.2.abs() <= gate).map(|z| (z.0, z.1)).collect();
+        self.judge(&on, zone.len(), center, radius, sight)
+    }
+
+    /// Fits once more without truncation, with the radius fixed and free, and decides.
+    fn judge(
+        &self,
+        on: &[(usize, usize)],
+        around: usize,
+        center: Vec3,
+        radius: f64,
+        sight: Option<Vec3>,
+    ) -> std::result::Result<Found, String> {
+        let purity = on.len() as f64 / around as f64;
+        if purity < PURITY {
+            return Err(format!("only {:.0} % of the surroundings lie on a sphere", 100.0 * purity));
+        }
+        let points: Vec<[f64; 3]> = on.iter().map(|z| self.points[z.0]).collect();
+        let start = Sphere { center_mm: center, radius_mm: radius };
+        let fixed = sphere::refine(&points, start, false, Noise::default()).map_err(|e| e.to_string())?;
+        let center = fixed.surface.center_mm;
+        let axis = sight.unwrap_or_else(|| points.iter().map(|p| (Vec3::from(*p) - center).normalize()).sum());
+        let coverage = coverage(&points, center, axis);
+        if coverage < COVERAGE {
+            return Err(format!("only {:.0} % of a hemisphere is seen", 100.0 * coverage));
+        }
+        let free = sphere::refine(&points, fixed.surface, true, Noise::default()).map_err(|e| e.to_string())?;
+        let sigma_radius = (free.covariance[(3, 3)] * correlation(on, &points, &free.surface, 4)).sqrt();
+        let miss = (free.surface.radius_mm - radius).abs();
+        if miss > SIGMAS * sigma_radius + SCALE * radius {
+            let seen = free.surface.radius_mm;
+            return Err(format!("a radius of {seen:.3} mm is seen, with a standard uncertainty of {sigma_radius:.3} mm"));
+        }
+        let scale = correlation(on, &points, &fixed.surface, 3);
+        let mut inliers: Vec<usize> = on.iter().map(|z| z.0).collect();
+        inliers.sort_unstable();
+        Ok(Found {
+            sphere: fixed.surface,
+            covariance: Matrix3::from_fn(|a, b| fixed.covariance[(a, b)] * scale),
+            rms_mm: fixed.rms_mm,
+            inliers,
+            coverage,
+            free_radius_mm: free.surface.radius_mm,
+            free_radius_sigma_mm: sigma_radius,
+        })
+    }
+
+    /// Three sigma, and never below the rounding of the coordinates.
+    fn gate(&self, sigma: f64, center: Vec3) -> f64 {
+        GATE * sigma + 16.0 * f64::EPSILON * center.amax()
+    }
+
+    /// The centre from the cells around the place whose normals agree.
+    fn settle_on_cells(&self, place: Vec3, radius: f64) -> std::result::Result<Vec3, String> {
+        let mut center = place;
+        for _ in 0..8 {
+            let on: Vec<[f64; 3]> = self.agreeing(center, radius).map(|c| c.mean.into()).collect();
+            if on.len() < 4 {
+                return Err("too few neighbouring normals meet".into());
+            }
+            let step = fixed_step(&on, center, radius).ok_or("the normals do not determine a centre")?;
+            center += step;
+            if (center - place).norm() > radius {
+                return Err("the points lead away from it".into());
+            }
+            if step.norm() < 1e-3 * radius {
+                break;
+            }
+        }
+        Ok(center)
+    }
+
+    /// Cells near the sphere's surface whose normals point to or from its centre.
+    fn agreeing(&self, center: Vec3, radius: f64) -> impl Iterator<Item = &Cell> {
+        const AGREE: f64 = 0.9; // cosine; 26°, more than the turn of the surface over a cell and its neighbours
+        self.cells.iter().filter(move |c| {
+            let d = c.mean - center;
+            let r = d.norm();
+            c.points > 0 && (r - radius).abs() < 0.125 * radius && c.normal.dot(&d).abs() > AGREE * r
+        })
+    }
+
+    /// Unit vector from the centre to the viewer. On a grid the pixel coordinates near the sphere are an affine function of
+    /// the points, and do not change along it; a bare cloud is seen from its origin if all of its points can be.
+    fn line_of_sight(&self, center: Vec3, radius: f64) -> Option<Vec3> {
+        match self.layout {
+            Layout::Grid { .. } => {
+                let (mut matrix, mut right) = (Matrix4::zeros(), [Vector4::zeros(); 2]);
+                let mut outward = Vec3::zeros();
+                for cell in self.agreeing(center, radius) {
+                    let q = (cell.mean - center) / radius;
+                    let row = Vector4::new(q[0], q[1], q[2], 1.0);
+                    matrix += row * row.transpose();
+                    for k in 0..2 {
+                        right[k] += row * cell.pixel[k];
+                    }
+                    outward += q;
+                }
+                let decomposed = matrix.lu();
+                let column = decomposed.solve(&right[0])?;
+                let row = decomposed.solve(&right[1])?;
+                let sight = column.xyz().cross(&row.xyz()).try_normalize(0.0)?;
+                Some(if sight.dot(&outward) < 0.0 { -sight } else { sight })
+            }
+            Layout::Bare { .. } => {
+                let (mut seen, mut all) = (0.0, 0.0);
+                for cell in self.agreeing(center, radius) {
+                    all += cell.points as f64;
+                    if (cell.mean - center).dot(&cell.mean) < 0.0 {
+                        seen += cell.points as f64;
+                    }
+                }
+                // A few cells on the limb may fall on the wrong side of it.
+                if seen < 0.95 * all { None } else { (-center).try_normalize(radius) }
+            }
+        }
+    }
+}
+
+/// One Gauss-Newton step of the centre of a sphere of fixed radius.
+fn fixed_step(points: &[[f64; 3]], center: Vec3, radius: f64) -> Option<Vec3> {
+    let (mut matrix, mut right) = (Matrix3::zeros(), Vec3::zeros());
+    for p in points {
+        let d = Vec3::from(*p) - center;
+        let r = d.norm();
+        if r > 0.0 {
+            let n = d / r;
+            matrix += n * n.transpose();
+            right += n * (r - radius);
+        }
+    }
+    // In a plane or on a line there is a direction without information.
+    if matrix.determinant() <= 1e-12 * matrix.trace().powi(3) {
+        return None;
+    }
+    matrix.cholesky().map(|c| c.solve(&right))
+}
+
+/// By how much the variance of a cell's mean residual exceeds that of independent residuals; at least 1.
+fn correlation(on: &[(usize, usize)], points: &[[f64; 3]], sphere: &Sphere, unknowns: usize) -> f64 {
+    let (mut squares, mut total) = (0.0, 0.0);
+    let (mut cells, mut at) = (0_usize, usize::MAX);
+    let (mut sum, mut n) = (0.0, 0.0);
+    for (&(_, cell), p) in on.iter().zip(points) {
+        let residual = (Vec3::from(*p) - sphere.center_mm).norm() - sphere.radius_mm;
+        total += residual * residual;
+        // The points come cell by cell.
+        if cell != at {
+            if n > 0.0 {
+                squares += sum * sum / n;
+            }
+            (sum, n, at) = (0.0, 0.0, cell);
+            cells += 1;
+        }
+        sum += residual;
+        n += 1.0;
+    }
+    squares += if n > 0.0 { sum * sum / n } else { 0.0 };
+    let variance = total / (on.len().saturating_sub(unknowns)).max(1) as f64;
+    let between = squares / cells.saturating_sub(unknowns).max(1) as f64;
+    if variance > 0.0 { (between / variance).max(1.0) } else { 1.0 }
+}
+
+/// Solid angle that the points cover, in parts of a hemisphere: occupied bins of equal area about `axis`.
+fn coverage(points: &[[f64; 3]], center: Vec3, axis: Vec3) -> f64 {
+    let axis = axis.try_normalize(1e-12).unwrap_or_else(Vec3::z);
+    let across = axis.cross(&if axis.x.abs() < 0.7 { Vec3::x() } else { Vec3::y() }).normalize();
+    let third = axis.cross(&across);
+    // Some eight points a bin on average, so that an empty bin is a gap and no chance.
+    let rings = (((points.len() as f64) / 8.0 / 2.0).sqrt() as usize).clamp(3, 16);
+    let sectors = 2 * rings;
+    let mut seen = vec![false; 2 * rings * sectors];
+    for p in points {
+        let d = Vec3::from(*p) - center;
+        let height = (d.dot(&axis) / d.norm()).clamp(-1.0, 1.0);
+        let angle = d.dot(&third).atan2(d.dot(&across)) / std::f64::consts::TAU + 0.5;
+        let ring = (((1.0 - height) * rings as f64) as usize).min(2 * rings - 1);
+        let sector = ((angle * sectors as f64) as usize).min(sectors - 1);
+        seen[ring * sectors + sector] = true;
+    }
+    seen.iter().filter(|s| **s).count() as f64 / (rings * sectors) as f64
+}
+
+/// Pixels along the side of a tile that is an eighth of the radius wide, from the typical distance of neighbours.
+fn tile_size(points: &[[f64; 3]], width: usize, radius: f64) -> usize {
+    const APART: usize = 4;
+    // A prime stride visits all columns; some thousand pairs tell the median well enough.
+    let stride = (points.len() / 8192).max(1) | 1;
+    let mut pitches: Vec<f64> = (0..points.len())
+        .step_by(stride)
+        .filter(|i| i % width + APART < width)
+        .map(|i| (Vec3::from(points[i + APART]) - Vec3::from(points[i])).norm() / APART as f64)
+        .filter(|d| d.is_finite() && *d > 0.0)
+        .collect();
+    if pitches.is_empty() {
+        return 2;
+    }
+    let middle = pitches.len() / 2;
+    let pitch = *pitches.select_nth_unstable_by(middle, f64::total_cmp).1;
+    ((radius / 8.0 / pitch) as usize).clamp(2, 64)
+}
+
+/// The cells of a band of `tile` rows; the index of an infinite coordinate if there is one.
+fn band_cells(band: &[[f64; 3]], width: usize, tile: usize, number: usize) -> std::result::Result<Vec<Cell>, usize> {
+    let columns = width.div_ceil(tile);
+    let mut cells = Vec::with_capacity(columns);
+    for first in (0..width).step_by(tile) {
+        let mut sums = [0.0; 15];
+        let mut origin = None;
+        for (row, line) in band.chunks(width).enumerate() {
+            let Some(part) = line.get(first..(first + tile).min(width)) else { continue };
+            for (column, p) in part.iter().enumerate() {
+                if !finite(p) {
+                    if p.iter().any(|v| v.is_infinite()) {
+                        return Err((number * tile + row) * width + first + column);
+                    }
+                    continue;
+                }
+                let o = *origin.get_or_insert(*p);
+                let (u, v) = (column as f64, row as f64);
+                let (x, y, z) = (p[0] - o[0], p[1] - o[1], p[2] - o[2]);
+                let terms = [1.0, u, v, u * u, u * v, v * v, x, y, z, x * u, y * u, z * u, x * v, y * v, z * v];
+                sums.iter_mut().zip(terms).for_each(|(s, t)| *s += t);
+            }
+        }
+        cells.push(tile_cell(&sums, origin, first, number * tile, tile));
+    }
+    Ok(cells)
+}
+
+/// Mean and normal of a tile: the points as a linear function of the pixel, whose slopes span the surface. The pixel is
+/// exact and the depth noisy, so this is also right where the surface is steep.
+fn tile_cell(sums: &[f64; 15], origin: Option<[f64; 3]>, column: usize, row: usize, tile: usize) -> Cell {
+    let Some(origin) = origin else { return Cell::default() };
+    let [n, u, v, uu, uv, vv, ..] = *sums;
+    let (mu, mv) = (u / n, v / n);
+    let mean = Vec3::new(sums[6], sums[7], sums[8]) / n;
+    let mut cell = Cell {
+        points: n as usize,
+        mean: mean + Vec3::from(origin),
+        normal: Vec3::zeros(),
+        pixel: [column as f64 + mu, row as f64 + mv],
+    };
+    let (suu, suv, svv) = (uu / n - mu * mu, uv / n - mu * mv, vv / n - mv * mv);
+    let determinant = suu * svv - suv * suv;
+    // Half a tile must be there, in both directions.
+    if 2.0 * n >= (tile * tile) as f64 && determinant > 1e-3 {
+        let pu = Vec3::new(sums[9], sums[10], sums[11]) / n - mean * mu;
+        let pv = Vec3::new(sums[12], sums[13], sums[14]) / n - mean * mv;
+        let along_u = (pu * svv - pv * suv) / determinant;
+        let along_v = (pv * suu - pu * suv) / determinant;
+        cell.normal = along_v.cross(&along_u).try_normalize(0.0).unwrap_or_default();
+    }
+    cell
+}
+
+type Key = [i64; 3];
+
+/// Spreads the bits of small integers; the default hasher guards against attacks that nobody makes on voxels.
+#[derive(Default)]
+struct Spread(u64);
+
+impl Hasher for Spread {
+    fn finish(&self) -> u64 {
+        self.0 ^ (self.0 >> 32)
+    }
+
+    fn write(&mut self, bytes: &[u8]) {
+        bytes.iter().for_each(|&b| self.write_u64(u64::from(b)));
+    }
+
+    fn write_u64(&mut self, value: u64) {
+        self.0 = (self.0.rotate_left(23) ^ value).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+    }
+
+    fn write_i64(&mut self, value: i64) {
+        self.write_u64(value as u64);
+    }
+
+}
+
+type Table<V> = HashMap<(i64, i64, i64), V, BuildHasherDefault<Spread>>;
+
+fn key(p: &Vec3, size: f64) -> Key {
+    std::array::from_fn(|k| (p[k] / size).floor() as i64)
+}
+
+/// Count, sums and second moments of the points of a voxel, about its centre, in units of its size.
+#[derive(Debug, Clone, Copy, Default)]
+struct Sums {
+    n: f64,
+    sum: Vec3,
+    second: Matrix3<f64>,
+}
+
+impl Sums {
+    fn add(&mut self, q: Vec3) {
+        self.n += 1.0;
+        self.sum += q;
+        self.second += q * q.transpose();
+    }
+
+    fn add_shifted(&mut self, other: &Self, d: Vec3) {
+        self.n += other.n;
+        self.sum += other.sum + d * other.n;
+        let cross = other.sum * d.transpose();
+        self.second += other.second + cross + cross.transpose() + d * d.transpose() * other.n;
+    }
+
+    /// Mean and normal; no normal where the points do not look like a surface.
+    fn plane(&self) -> (Vec3, Vec3) {
+        let mean = self.sum / self.n;
+        if self.n < 6.0 {
+            return (mean, Vec3::zeros());
+        }
+        let (variances, axes) = principal(&(self.second / self.n - mean * mean.transpose()));
+        // Thickness below half the width: a voxel neighbourhood across an edge or in a haze has no normal.
+        let surface = variances[0] < 0.25 * variances[1];
+        (mean, if surface { axes.column(0).into() } else { Vec3::zeros() })
+    }
+}
+
+struct Voxels {
+    origin: Vec3,
+    keys: Vec<Key>,
+    table: Table<usize>,
+    sums: Vec<Sums>,
+    order: Vec<usize>,
+    starts: Vec<usize>,
+}
+
+impl Voxels {
+    fn of(points: &[[f64; 3]], size: f64) -> Self {
+        let origin = Vec3::from_fn(|k, _| points.iter().map(|p| p[k]).fold(f64::INFINITY, f64::min));
+        let mut table = Table::default();
+        let (mut keys, mut sums): (Vec<Key>, Vec<Sums>) = (Vec::new(), Vec::new());
+        let mut of_point = Vec::with_capacity(points.len());
+        for p in points {
+            let q = Vec3::from(*p) - origin;
+            let k = key(&q, size);
+            let id = *table.entry((k[0], k[1], k[2])).or_insert_with(|| {
+                keys.push(k);
+                sums.push(Sums::default());
+                keys.len() - 1
+            });
+            sums[id].add(Vec3::from_fn(|i, _| q[i] / size - k[i] as f64 - 0.5));
+            of_point.push(id);
+        }
+        let mut starts = Vec::with_capacity(keys.len());
+        let mut at = 0;
+        for s in &sums {
+            starts.push(at);
+            at += s.n as usize;
+        }
+        let (mut next, mut order) = (starts.clone(), vec![0; points.len()]);
+        for (i, &id) in of_point.iter().enumerate() {
+            order[next[id]] = i;
+            next[id] += 1;
+        }
+        Self { origin, keys, table, sums, order, starts }
+    }
+
+    /// The sums of a voxel and its 26 neighbours.
+    fn merged(&self, id: usize) -> Sums {
+        let k = self.keys[id];
+        let mut all = Sums::default();
+        for x in -1..=1 {
+            for y in -1..=1 {
+                for z in -1..=1 {
+                    let neighbour = (k[0].saturating_add(x), k[1].saturating_add(y), k[2].saturating_add(z));
+                    if let Some(&other) = self.table.get(&neighbour) {
+                        all.add_shifted(&self.sums[other], Vec3::new(x as f64, y as f64, z as f64));
+                    }
+                }
+            }
+        }
+        all
+    }
+}
+
+/// Centres that the cells vote for, in voxels a fifth of the radius wide.
+struct Votes {
+    size: f64,
+    places: Vec<Vec3>,
+    table: Table<Vec<u32>>,
+}
+
+impl Votes {
+    fn of(cells: &[Cell], radius: f64) -> Self {
+        let mut votes = Self { size: radius / 5.0, places: Vec::new(), table: Table::default() };
+        for cell in cells {
+            if cell.points > 0 && cell.normal != Vec3::zeros() {
+                for side in [-1.0, 1.0] {
+                    let place = cell.mean + cell.normal * (side * radius);
+                    let k = key(&place, votes.size);
+                    votes.table.entry((k[0], k[1], k[2])).or_default().push(votes.places.len() as u32);
+                    votes.places.push(place);
+                }
+            }
+        }
+        votes
+    }
+
+    /// Voxels where at least three votes meet, most first.
+    fn peaks(&self) -> Vec<Vec3> {
+        let mut peaks: Vec<(usize, u32)> =
+            self.table.values().filter(|v| v.len() >= 3).map(|v| (v.len(), v[0])).collect();
+        peaks.sort_unstable_by_key(|&(n, first)| (std::cmp::Reverse(n), first));
+        peaks.iter().map(|&(_, first)| self.places[first as usize]).collect()
+    }
+
+    /// The mean of the votes around a place, followed uphill.
+    fn settle(&self, place: Vec3) -> Vec3 {
+        let mut center = place;
+        for _ in 0..3 {
+            let k = key(&center, self.size);
+            let (mut sum, mut n) = (Vec3::zeros(), 0.0);
+            for x in -1..=1 {
+                for y in -1..=1 {
+                    for z in -1..=1 {
+                        let at = (k[0].saturating_add(x), k[1].saturating_add(y), k[2].saturating_add(z));
+                        for &i in self.table.get(&at).into_iter().flatten() {
+                            let p = self.places[i as usize];
+                            if (p - center).norm() < self.size {
+                                sum += p;
+                                n += 1.0;
+                            }
+                        }
+                    }
+                }
+            }
+            if n > 0.0 {
+                center = sum / n;
+            }
+        }
+        center
+    }
+}

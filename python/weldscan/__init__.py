@@ -6,12 +6,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from weldscan._weldcore import (
+    FoundSphere,
     KdTree,
     Lens,
     RigidFit,
     Scanner,
     SimulatedShot,
     __version__,
+    find_spheres,
     register_rigid,
     set_threads,
     simulate_shot,
@@ -52,6 +54,7 @@ def __getattr__(name: str) -> Any:
 __all__ = [
     "DeviceError",
     "DeviceTimeout",
+    "FoundSphere",
     "GeometryError",
     "InputError",
     "KdTree",
@@ -64,6 +67,7 @@ __all__ = [
     "SimulatedShot",
     "WeldscanError",
     "__version__",
+    "find_spheres",
     "format_e6axis",
     "format_e6pos",
     "format_frame",

@@ -6,12 +6,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
+    "FoundSphere",
     "KdTree",
     "Lens",
     "RigidFit",
     "Scanner",
     "SimulatedShot",
     "__version__",
+    "find_spheres",
     "register_rigid",
     "set_threads",
     "simulate_shot",
@@ -101,3 +103,25 @@ def simulate_shot(
     seed: int = 0,
 ) -> SimulatedShot: ...
 def simulated_step(weld: Any, along: NDArray[np.float64]) -> NDArray[np.float64]: ...
+
+# fit
+@final
+class FoundSphere:
+    @property
+    def center_mm(self) -> NDArray[np.float64]: ...
+    @property
+    def radius_mm(self) -> float: ...
+    @property
+    def covariance(self) -> NDArray[np.float64]: ...
+    @property
+    def rms_mm(self) -> float: ...
+    @property
+    def inliers(self) -> NDArray[np.int64]: ...
+    @property
+    def coverage(self) -> float: ...
+    @property
+    def free_radius_mm(self) -> float: ...
+    @property
+    def free_radius_sigma_mm(self) -> float: ...
+
+def find_spheres(points: ArrayLike, radius_mm: float, count: int | None = None) -> list[FoundSphere]: ...

@@ -16,8 +16,8 @@ use crate::Vec3;
 use crate::error::{Error, Result, require_finite};
 use crate::threads;
 
-/// A fitted surface and how well the points support it. `S` is [`plane::Plane`], [`sphere::Sphere`] or
-/// [`cylinder::Cylinder`].
+/// A fitted surface and how well the points support it. `S` is a plane, [`sphere::Sphere`] or
+/// a cylinder.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fit<S> {
     /// The surface.

@@ -37,13 +37,23 @@ const SCALE: f64 = 0.005;
 const SIGMAS: f64 = 4.0;
 /// Places looked at before the search gives up; votes of a cylinder of the same radius meet all along its axis.
 const MAX_PLACES: usize = 256;
+/// Voxels of votes followed uphill.
+const MAX_PEAKS: usize = 4096;
+/// Votes meet in a ball of this part of the radius, ...
+const BALL: f64 = 0.2;
+/// ... and must be this many times those that a plane leaves in one.
+const ABOVE_PLANE: f64 = 2.0;
+
+/// What no scanner's calibration is free of: a two-hundredth of a pixel, in each direction, common to a whole sphere.
+const SYSTEMATIC_PX: f64 = 0.005;
 
 /// A sphere found in a cloud.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Found {
     /// Its centre, and the radius that was given.
     pub sphere: Sphere,
-    /// Covariance of the centre, mm²: from the residuals, and enlarged where neighbouring residuals go together.
+    /// Covariance of the centre, mm²: from the residuals, enlarged where neighbouring residuals go together, and on a
+    /// grid with a two-hundredth of a pixel for what the calibration of a scanner leaves.
     pub covariance: Matrix3<f64>,
     /// Root mean square of the inliers' distances from the sphere, mm.
     pub rms_mm: f64,
@@ -112,6 +122,8 @@ struct Cloud<'a> {
     points: &'a [[f64; 3]],
     layout: Layout,
     cells: Vec<Cell>,
+    /// Side of a cell, mm.
+    side: f64,
 }
 
 fn finite(p: &[f64; 3]) -> bool {
@@ -124,7 +136,7 @@ impl<'a> Cloud<'a> {
             let got = format!("{} points", points.len());
             return Err(Error::Shape { what: "points", expected: format!("rows of {width} pixels"), got });
         }
-        let tile = tile_size(points, width, radius);
+        let (tile, side) = tile_size(points, width, radius);
         let columns = width.div_ceil(tile);
         let rows: Vec<std::result::Result<Vec<Cell>, usize>> = threads::install(|| {
             points.par_chunks(width * tile).enumerate().map(|(r, band)| band_cells(band, width, tile, r)).collect()
@@ -133,20 +145,27 @@ impl<'a> Cloud<'a> {
         for row in rows {
             cells.extend(row.map_err(|index| Error::NonFinite { what: "points", index })?);
         }
-        Ok(Self { points, layout: Layout::Grid { width, tile, columns }, cells })
+        Ok(Self { points, layout: Layout::Grid { width, tile, columns }, cells, side })
     }
 
     fn of_bare(points: &'a [[f64; 3]], radius: f64) -> Self {
         // Normals need about this many points.
-        const ENOUGH: usize = 12;
+        const ENOUGH: f64 = 12.0;
         let mut size = radius / 8.0;
         loop {
             let voxels = Voxels::of(points, size);
-            let merged: Vec<Sums> = threads::install(|| (0..voxels.keys.len()).into_par_iter().map(|i| voxels.merged(i)).collect());
-            let mut counts: Vec<usize> = merged.iter().map(|m| m.n as usize).collect();
-            let middle = counts.len() / 2;
-            let typical = if counts.is_empty() { 0 } else { *counts.select_nth_unstable(middle).1 };
-            if typical < ENOUGH && size < radius / 3.0 && !counts.is_empty() {
+            let merged: Vec<Sums> =
+                threads::install(|| (0..voxels.keys.len()).into_par_iter().map(|i| voxels.merged(i)).collect());
+            // As a typical point sees it: strays fill many voxels.
+            let mut counts: Vec<(f64, f64)> = merged.iter().zip(&voxels.sums).map(|(m, s)| (m.n, s.n)).collect();
+            counts.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+            let mut below = 0.0;
+            let middle = counts.iter().find(|c| {
+                below += c.1;
+                2.0 * below >= points.len() as f64
+            });
+            let typical = middle.map_or(0.0, |c| c.0);
+            if typical < ENOUGH && size < radius / 3.0 && !points.is_empty() {
                 size *= 1.3;
                 continue;
             }
@@ -157,7 +176,12 @@ impl<'a> Cloud<'a> {
                 Cell { points: voxels.sums[i].n as usize, mean: mean * size + offset, normal, pixel: [0.0; 2] }
             };
             let cells = threads::install(|| (0..merged.len()).into_par_iter().map(cell).collect());
-            return Self { points, layout: Layout::Bare { order: voxels.order, starts: voxels.starts }, cells };
+            return Self {
+                points,
+                layout: Layout::Bare { order: voxels.order, starts: voxels.starts },
+                cells,
+                side: size,
+            };
         }
     }
 
@@ -183,11 +207,16 @@ impl<'a> Cloud<'a> {
         let votes = Votes::of(&self.cells, radius);
         let (mut found, mut refused): (Vec<Found>, Vec<(Vec3, String)>) = (Vec::new(), Vec::new());
         let mut looked: Vec<Vec3> = Vec::new();
+        let plane = std::f64::consts::PI * (BALL * radius / self.side).powi(2);
+        let enough = (ABOVE_PLANE * plane).max(4.0);
         for peak in votes.peaks() {
             if looked.len() >= MAX_PLACES {
                 break;
             }
-            let place = votes.settle(peak);
+            let (place, support) = votes.settle(peak);
+            if (support as f64) < enough {
+                continue;
+            }
             // Two spheres cannot share space; and a place that was refused is not worth another look close by.
             let taken = found.iter().any(|f| (f.sphere.center_mm - place).norm() < radius);
             if taken || looked.iter().any(|p| (p - place).norm() < 0.3 * radius) {
@@ -240,8 +269,7 @@ impl<'a> Cloud<'a> {
             // The median of |residual| of a normal distribution is 0.6745 sigma.
             sigma = *sizes.select_nth_unstable_by(middle, f64::total_cmp).1 / 0.6745;
             let gate = self.gate(sigma, center);
-            let on: Vec<[f64; 3]> =
-                zone.iter().filter(|z| z.2.abs() <= gate).map(|z| self.points[z.0]).collect();
+            let on: Vec<[f64; 3]> = zone.iter().filter(|z| z.2.abs() <= gate).map(|z| self.points[z.0]).collect();
             let step = fixed_step(&on, center, radius).ok_or("the points do not determine a sphere")?;
             center += step;
             if step.norm() < 1e-9 * radius {
@@ -286,14 +314,20 @@ impl<'a> Cloud<'a> {
         let miss = (free.surface.radius_mm - radius).abs();
         if miss > SIGMAS * sigma_radius + SCALE * radius {
             let seen = free.surface.radius_mm;
-            return Err(format!("a radius of {seen:.3} mm is seen, with a standard uncertainty of {sigma_radius:.3} mm"));
+            return Err(format!(
+                "a radius of {seen:.3} mm is seen, with a standard uncertainty of {sigma_radius:.3} mm"
+            ));
         }
         let scale = correlation(on, &points, &fixed.surface, 3);
+        let systematic = match self.layout {
+            Layout::Grid { tile, .. } => (SYSTEMATIC_PX * self.side / tile as f64).powi(2),
+            Layout::Bare { .. } => 0.0,
+        };
         let mut inliers: Vec<usize> = on.iter().map(|z| z.0).collect();
         inliers.sort_unstable();
         Ok(Found {
             sphere: fixed.surface,
-            covariance: Matrix3::from_fn(|a, b| fixed.covariance[(a, b)] * scale),
+            covariance: Matrix3::from_fn(|a, b| fixed.covariance[(a, b)] * scale) + Matrix3::identity() * systematic,
             rms_mm: fixed.rms_mm,
             inliers,
             coverage,
@@ -324,6 +358,18 @@ impl<'a> Cloud<'a> {
                 break;
             }
         }
+        // The same test as for the points, before they are looked at.
+        let mut sizes: Vec<f64> = self
+            .cells
+            .iter()
+            .filter(|c| c.points > 0)
+            .map(|c| ((c.mean - center).norm() - radius).abs())
+            .filter(|r| *r < ZONE * radius)
+            .collect();
+        let middle = sizes.len() / 2;
+        if sizes.is_empty() || *sizes.select_nth_unstable_by(middle, f64::total_cmp).1 > NOISE * radius {
+            return Err(format!("its surroundings do not lie on a sphere of radius {radius} mm"));
+        }
         Ok(center)
     }
 
@@ -348,9 +394,7 @@ impl<'a> Cloud<'a> {
                     let q = (cell.mean - center) / radius;
                     let row = Vector4::new(q[0], q[1], q[2], 1.0);
                     matrix += row * row.transpose();
-                    for k in 0..2 {
-                        right[k] += row * cell.pixel[k];
-                    }
+                    right.iter_mut().zip(cell.pixel).for_each(|(sum, pixel)| *sum += row * pixel);
                     outward += q;
                 }
                 let decomposed = matrix.lu();
@@ -438,8 +482,8 @@ fn coverage(points: &[[f64; 3]], center: Vec3, axis: Vec3) -> f64 {
     seen.iter().filter(|s| **s).count() as f64 / (rings * sectors) as f64
 }
 
-/// Pixels along the side of a tile that is an eighth of the radius wide, from the typical distance of neighbours.
-fn tile_size(points: &[[f64; 3]], width: usize, radius: f64) -> usize {
+/// Pixels along the side of a tile that is an eighth of the radius wide, and its width in mm, from the typical distance of neighbours.
+fn tile_size(points: &[[f64; 3]], width: usize, radius: f64) -> (usize, f64) {
     const APART: usize = 4;
     // A prime stride visits all columns; some thousand pairs tell the median well enough.
     let stride = (points.len() / 8192).max(1) | 1;
@@ -450,11 +494,12 @@ fn tile_size(points: &[[f64; 3]], width: usize, radius: f64) -> usize {
         .filter(|d| d.is_finite() && *d > 0.0)
         .collect();
     if pitches.is_empty() {
-        return 2;
+        return (2, radius);
     }
     let middle = pitches.len() / 2;
     let pitch = *pitches.select_nth_unstable_by(middle, f64::total_cmp).1;
-    ((radius / 8.0 / pitch) as usize).clamp(2, 64)
+    let tile = ((radius / 8.0 / pitch) as usize).clamp(2, 64);
+    (tile, tile as f64 * pitch)
 }
 
 /// The cells of a band of `tile` rows; the index of an infinite coordinate if there is one.
@@ -533,7 +578,6 @@ impl Hasher for Spread {
     fn write_i64(&mut self, value: i64) {
         self.write_u64(value as u64);
     }
-
 }
 
 type Table<V> = HashMap<(i64, i64, i64), V, BuildHasherDefault<Spread>>;
@@ -635,7 +679,7 @@ impl Voxels {
     }
 }
 
-/// Centres that the cells vote for, in voxels a fifth of the radius wide.
+/// Centres that the cells vote for, in voxels as wide as the radius of the ball in which they must meet.
 struct Votes {
     size: f64,
     places: Vec<Vec3>,
@@ -644,7 +688,7 @@ struct Votes {
 
 impl Votes {
     fn of(cells: &[Cell], radius: f64) -> Self {
-        let mut votes = Self { size: radius / 5.0, places: Vec::new(), table: Table::default() };
+        let mut votes = Self { size: BALL * radius, places: Vec::new(), table: Table::default() };
         for cell in cells {
             if cell.points > 0 && cell.normal != Vec3::zeros() {
                 for side in [-1.0, 1.0] {
@@ -663,15 +707,15 @@ impl Votes {
         let mut peaks: Vec<(usize, u32)> =
             self.table.values().filter(|v| v.len() >= 3).map(|v| (v.len(), v[0])).collect();
         peaks.sort_unstable_by_key(|&(n, first)| (std::cmp::Reverse(n), first));
-        peaks.iter().map(|&(_, first)| self.places[first as usize]).collect()
+        peaks.iter().take(MAX_PEAKS).map(|&(_, first)| self.places[first as usize]).collect()
     }
 
-    /// The mean of the votes around a place, followed uphill.
-    fn settle(&self, place: Vec3) -> Vec3 {
-        let mut center = place;
+    /// The mean of the votes around a place, followed uphill, and their number.
+    fn settle(&self, place: Vec3) -> (Vec3, usize) {
+        let (mut center, mut support) = (place, 0);
         for _ in 0..3 {
             let k = key(&center, self.size);
-            let (mut sum, mut n) = (Vec3::zeros(), 0.0);
+            let (mut sum, mut n) = (Vec3::zeros(), 0);
             for x in -1..=1 {
                 for y in -1..=1 {
                     for z in -1..=1 {
@@ -680,16 +724,145 @@ impl Votes {
                             let p = self.places[i as usize];
                             if (p - center).norm() < self.size {
                                 sum += p;
-                                n += 1.0;
+                                n += 1;
                             }
                         }
                     }
                 }
             }
-            if n > 0.0 {
-                center = sum / n;
+            if n > 0 {
+                center = sum / n as f64;
+            }
+            support = n;
+        }
+        (center, support)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Uniform in [0, 1) from a counter.
+    fn uniform(i: usize) -> f64 {
+        let mut z = (i as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15).wrapping_add(0x1234_5678);
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    fn normal(i: usize) -> f64 {
+        (-2.0 * (1.0 - uniform(2 * i)).ln()).sqrt() * (std::f64::consts::TAU * uniform(2 * i + 1)).cos()
+    }
+
+    const WIDTH: usize = 320;
+    const NOISE_MM: f64 = 0.03;
+
+    /// A pinhole camera's view of spheres (centre, radius), a cylinder along y (x, z, radius) and a plate.
+    fn grid(spheres: &[([f64; 3], f64)], cylinder: Option<(f64, f64, f64)>) -> Vec<[f64; 3]> {
+        let mut points = Vec::new();
+        for row in 0..240 {
+            for column in 0..WIDTH {
+                let ray = Vec3::new((column as f64 - 159.5) / 1300.0, (row as f64 - 119.5) / 1300.0, 1.0);
+                let mut nearest = if column < 12 { f64::NAN } else { (430.0 + 0.2 * ray.y) / (1.0 + 0.3 * ray.x) };
+                let mut hit = |a: f64, b: f64, c: f64| {
+                    let root = (b * b - a * c).sqrt();
+                    if root.is_finite() {
+                        nearest = nearest.min((b - root) / a);
+                    }
+                };
+                for &(c, r) in spheres {
+                    let c = Vec3::from(c);
+                    hit(ray.norm_squared(), ray.dot(&c), c.norm_squared() - r * r);
+                }
+                if let Some((x, z, r)) = cylinder {
+                    hit(ray.x * ray.x + 1.0, ray.x * x + z, x * x + z * z - r * r);
+                }
+                let depth = nearest + NOISE_MM * normal(row * WIDTH + column);
+                points.push((ray * depth).into());
             }
         }
-        center
+        points
     }
+
+    const BALLS: [([f64; 3], f64); 3] =
+        [([-20.0, -15.0, 412.0], 10.0), ([25.0, -12.0, 405.0], 10.0), ([2.0, 20.0, 410.0], 10.0)];
+
+    /// Six standard deviations of a centre from some 2,500 points of the given noise, with a two-hundredth of a pixel.
+    const CENTRE_TOLERANCE_MM: f64 = 6.0 * 0.003;
+
+    #[test]
+    fn the_spheres_of_a_plate_are_found_and_another_size_and_a_pin_are_not() {
+        let mut scene = BALLS.to_vec();
+        scene.push(([-30.0, 22.0, 411.0], 11.0));
+        let points = grid(&scene, None);
+        let found = find(&points, Some(WIDTH), 10.0, None).unwrap();
+        assert_eq!(found.len(), 3);
+        for (center, _) in BALLS {
+            let f = found.iter().find(|f| (f.sphere.center_mm - Vec3::from(center)).norm() < 1.0).unwrap();
+            let miss = f.sphere.center_mm - Vec3::from(center);
+            assert!(miss.amax() < CENTRE_TOLERANCE_MM, "{miss}");
+            let squared = miss.dot(&f.covariance.try_inverse().unwrap().mul(miss));
+            // The 1e-5 quantile of chi² with 3 degrees of freedom.
+            assert!(squared < 25.9, "{squared}");
+            assert!(f.coverage > 0.4);
+        }
+        let error = find(&points, Some(WIDTH), 10.0, Some(4)).unwrap_err().to_string();
+        assert!(error.contains("3 of 4") && error.contains("a radius of 1"), "{error}");
+        assert_eq!(find(&points, Some(WIDTH), 11.0, None).unwrap().len(), 1);
+
+        let pin = grid(&[], Some((3.0, 410.0, 10.0)));
+        assert_eq!(find(&pin, Some(WIDTH), 10.0, None).unwrap(), []);
+        assert_eq!(find(&grid(&[], None), Some(WIDTH), 10.0, None).unwrap(), []);
+    }
+
+    #[test]
+    fn the_bits_do_not_depend_on_the_threads() {
+        let points = grid(&BALLS, None);
+        let run = |n, width| {
+            threads::set_threads(Some(n)).unwrap();
+            let keep: Vec<_> = points.iter().copied().filter(|p| width == Some(WIDTH) || finite(p)).collect();
+            find(&keep, width, 10.0, Some(3)).unwrap()
+        };
+        for width in [Some(WIDTH), None] {
+            let one = run(1, width);
+            assert!(one == run(2, width) && one == run(8, width));
+        }
+        threads::set_threads(None).unwrap();
+    }
+
+    #[test]
+    fn a_bare_cloud_of_whole_spheres_keeps_all_of_their_points() {
+        let n = 8_000;
+        let mut points: Vec<[f64; 3]> = Vec::new();
+        for (k, center) in [[0.0, 0.0, 300.0], [20.5, 0.0, 300.0]].into_iter().enumerate() {
+            for i in 0..n {
+                let d = Vec3::from_fn(|a, _| normal(3 * (i + k * n) + a)).normalize();
+                points.push((Vec3::from(center) + d * (10.0 + 0.02 * normal(100_000 + i))).into());
+            }
+        }
+        for i in 0..4_000 {
+            points.push(std::array::from_fn(|a| 60.0 * (uniform(7 * i + a) - 0.5) + if a == 2 { 300.0 } else { 0.0 }));
+        }
+        let found = find(&points, None, 10.0, Some(2)).unwrap();
+        for f in found {
+            assert!(f.sphere.center_mm.y.abs() < 0.002 && f.inliers.len() > 7_900 && f.coverage > 1.9);
+        }
+    }
+
+    #[test]
+    fn bad_input_is_refused() {
+        assert!(matches!(find(&[], None, 0.0, None), Err(Error::OutOfRange { .. })));
+        assert!(matches!(find(&[], None, 1.0, Some(0)), Err(Error::OutOfRange { .. })));
+        assert!(matches!(find(&[[0.0; 3]; 5], Some(2), 1.0, None), Err(Error::Shape { .. })));
+        assert!(matches!(find(&[[f64::NAN; 3]; 5], None, 1.0, None), Err(Error::NonFinite { .. })));
+        assert!(matches!(find(&[[f64::INFINITY; 3]; 4], Some(2), 1.0, None), Err(Error::NonFinite { .. })));
+        for width in [None, Some(2)] {
+            assert!(matches!(find(&[[1.0; 3]; 4], width, 1.0, Some(1)), Err(Error::NotFound { .. })));
+            assert_eq!(find(&[], width, 1.0, None).unwrap(), []);
+            assert_eq!(find(&[[1e300, -1e300, 0.0]; 4], width, 1e-300, None).unwrap(), []);
+        }
+    }
+
+    use std::ops::Mul;
 }

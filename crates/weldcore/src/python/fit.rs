@@ -114,7 +114,12 @@ impl FoundSphere {
 ///     True
 #[pyfunction]
 #[pyo3(signature = (points, radius_mm, count=None))]
-fn find_spheres(py: Python<'_>, points: &Bound<'_, PyAny>, radius_mm: f64, count: Option<usize>) -> PyResult<Vec<FoundSphere>> {
+fn find_spheres(
+    py: Python<'_>,
+    points: &Bound<'_, PyAny>,
+    radius_mm: f64,
+    count: Option<usize>,
+) -> PyResult<Vec<FoundSphere>> {
     let array = floats::<IxDyn>("points", points)?;
     let width = match *array.shape() {
         [_, 3] => None,

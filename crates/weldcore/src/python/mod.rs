@@ -7,6 +7,7 @@ use numpy::{PyArray, PyArrayMethods, PyReadonlyArray, PyReadonlyArray2, PyUntype
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
+mod fit;
 mod kdtree;
 mod scanner;
 mod simulate;
@@ -110,6 +111,7 @@ fn set_threads(py: Python<'_>, threads: Option<usize>) -> PyResult<()> {
 fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("__version__", env!("CARGO_PKG_VERSION"))?;
     m.add_function(wrap_pyfunction!(set_threads, m)?)?;
+    fit::register(m)?;
     scanner::register(m)?;
     kdtree::register(m)?;
     transform::register(m)?;

@@ -6,6 +6,7 @@ the file and the field: `open-630/session.json: shots.3.flange_pose.B: NaN is no
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -691,6 +692,9 @@ def _write_image(path: Path, image: Image, size: tuple[int, int]) -> None:
     path.write_bytes(data.tobytes())
 
 
+CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
+
+
 class whole_folder:
     """A folder that appears complete or not at all: `with whole_folder(path) as partial: ...` fills `partial`.
 
@@ -737,7 +741,7 @@ class whole_folder:
             raise InputError(f"{self.path}: cannot be written: {failure.strerror or failure}") from None
         finally:
             shutil.rmtree(self.partial, ignore_errors=True)
-        if isinstance(error, OSError):
+        if isinstance(error, OSError) and error.errno in CANNOT_WRITE:
             raise InputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
 
     def _swap(self) -> None:

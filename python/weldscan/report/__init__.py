@@ -251,8 +251,9 @@ def ply(cloud: PartCloud | None) -> bytes:
 
 def html(inspection: Inspection, created: datetime) -> str:
     """The report: one file without any reference to another."""
-    from jinja2 import Environment, StrictUndefined  # noqa: PLC0415  (30 ms that only the report needs)
-    from markupsafe import Markup  # noqa: PLC0415
+    # 30 ms that only the page needs.
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
 
     here = resources.files(__name__)
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)

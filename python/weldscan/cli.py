@@ -1,0 +1,281 @@
+"""The command line: `weldscan inspect`, `demo`, `calibrate hand-eye`, `validate`.
+
+Heavy imports happen inside the commands, so that `--help` and a typing error answer at once. What went well goes to
+stdout; progress (a bar on a terminal, JSON lines otherwise) and complaints, each in one line, go to stderr.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from weldscan._weldcore import __version__
+from weldscan.errors import NotMeasured, WeldscanError
+from weldscan.result import Verdict
+
+if TYPE_CHECKING:
+    from weldscan.result import Inspection
+
+EXIT_CODES = {
+    Verdict.PASS: 0,
+    Verdict.FAIL: 3,
+    Verdict.INCONCLUSIVE: 4,
+    Verdict.NOT_MEASURED: 5,
+    Verdict.NOT_ASSESSABLE: 5,
+}
+OUR_FAULT, BAD_INPUT, INTERRUPTED = 1, 2, 130
+EXITS = (
+    "Exit code: 0 PASS, 3 FAIL, 4 INCONCLUSIVE, 5 NOT MEASURED or NOT ASSESSABLE, 2 bad input, 1 an error of weldscan."
+)
+DEFAULT_NORM = "pnae-g-7-010-89"
+COLOURS = {Verdict.PASS: 32, Verdict.FAIL: 31, Verdict.INCONCLUSIVE: 33}
+
+Progress = Callable[[int, int, str], None]
+
+
+class Method(StrEnum):
+    """Which number is judged."""
+
+    surface = "surface"
+    paper = "paper"
+
+
+app = typer.Typer(
+    name="weldscan",
+    help="Measures the edge displacement (hi-lo) of butt welds from structured-light scans, with U and a verdict.",
+    epilog="Try it without any hardware: weldscan demo",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+calibrate = typer.Typer(
+    help="Calibrations that are kept and used again.", no_args_is_help=True, rich_markup_mode=None, add_completion=False
+)
+app.add_typer(calibrate, name="calibrate")
+
+SessionFolder = Annotated[
+    Path, typer.Argument(metavar="SESSION", help="A folder with session.json and shots/ (weldscan-session/1).")
+]
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"weldscan {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Measures the edge displacement (hi-lo) of butt welds from structured-light scans, with U and a verdict."""
+
+
+@app.command(
+    epilog=f"Example: weldscan inspect pipe-17 --out pipe-17-report --norm {DEFAULT_NORM} --norm iso-5817:B    {EXITS}"
+)
+def inspect(
+    session: SessionFolder,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Where the result goes: new, empty, or an earlier result. Default: SESSION's name + '-report'."
+        ),
+    ] = None,
+    method: Annotated[
+        Method, typer.Option(help="Which number is judged; both are reported. surface: the largest step at the seam.")
+    ] = Method.surface,
+    norm: Annotated[
+        list[str] | None,
+        typer.Option(help=f"Judge by this norm; may be given several times. Default: {DEFAULT_NORM}.", metavar="ID"),
+    ] = None,
+) -> None:
+    """Measure a recorded session and judge it: result.json, report.html, profile.csv, cloud.ply."""
+    from weldscan.norms import load_norm
+    from weldscan.report import is_result
+    from weldscan.session import whole_folder
+
+    norms = tuple(dict.fromkeys(norm or [DEFAULT_NORM]))
+    for norm_id in norms:
+        load_norm(norm_id)
+    out = out if out is not None else Path(f"{session.resolve().name}-report")
+    whole_folder.check(out, is_result)
+    found = _inspect_into(session, out, method, norms)
+    _summary(found, out)
+    raise typer.Exit(EXIT_CODES[found.verdict])
+
+
+@app.command(epilog="Example: weldscan demo --out /tmp/weldscan-demo")
+def demo(
+    out: Annotated[Path, typer.Option(help="Where session and report go; an earlier demo is replaced.")] = Path(
+        "weldscan-demo"
+    ),
+) -> None:
+    """Simulate a cell (scanner, robot, three-sphere plate, welded pipe), record a session and inspect it."""
+    from weldscan.devices.simulated import simulate_session
+    from weldscan.session import whole_folder
+
+    with whole_folder(out, _is_demo) as partial:
+        with _progress() as progress:
+            truth = simulate_session(partial / "session", progress=progress)
+        found = _inspect_into(partial / "session", partial / "report", Method.surface, (DEFAULT_NORM,))
+    _summary(found, out / "report")
+    true = truth["step_mm"]
+    print(f"       truth: largest {true['max_abs']:.3f} mm, mean {true['mean']:.3f} mm")
+    print(f"       the same again from its images: weldscan inspect {out / 'session'}")
+    raise typer.Exit(EXIT_CODES[found.verdict])
+
+
+@calibrate.command("hand-eye", epilog="Example: weldscan calibrate hand-eye plate-shots --out hand-eye.json")
+def calibrate_hand_eye(
+    session: SessionFolder,
+    out: Annotated[Path, typer.Option(help="The file to write; an earlier hand-eye calibration is replaced.")] = Path(
+        "hand-eye.json"
+    ),
+) -> None:
+    """Find where the scanner sits on the robot's flange, from shots of the three-sphere plate, and keep it."""
+    from weldscan.calibration.hand_eye import calibrate as solve
+    from weldscan.calibration.hand_eye import write_hand_eye
+
+    with _progress() as progress:
+        found = solve(session, progress)
+    write_hand_eye(out, found)
+    print(
+        f"hand-eye {found.id} from {len(found.per_shot)} shots: residual {found.residual_rms_mm:.3f} mm rms, "
+        f"u of a point at the working distance {found.working_point_u_mm:.3f} mm"
+    )
+    print(f'         kept in {out}; a session carries it as "hand_eye": "{out.name}"')
+
+
+@app.command(epilog="Example: weldscan validate pipe-17 --touch pipe-17/touch.csv --out pipe-17-touch")
+def validate(
+    session: SessionFolder,
+    touch: Annotated[Path, typer.Option(help="Points that a contact probe read on the part: x_mm,y_mm,z_mm in base.")],
+    out: Annotated[Path | None, typer.Option(help="Also write validation.json and validation.html there.")] = None,
+) -> None:
+    """Hold the scanned surface against points probed on the part."""
+    from weldscan.validation import validate as hold_against
+
+    with _progress() as progress:
+        found: Any = hold_against(session, touch, progress)
+    print(found)
+    if out is not None:
+        print(out)
+
+
+# --- behind the commands ----------------------------------------------------------------------------------------------
+
+
+def _inspect_into(session: Path, out: Path, method: Method, norms: tuple[str, ...]) -> Inspection:
+    from weldscan.inspection import inspect as measure
+    from weldscan.report import write_report
+
+    with _progress() as progress:
+        found: Inspection = measure(session, method=method.value, norms=norms, progress=progress)
+        progress(1, 1, "writing the report")
+        write_report(found, out)
+    return found
+
+
+def _summary(found: Inspection, out: Path) -> None:
+    """A few lines: the verdict, the value with its uncertainty, the limit, where, and the report's path."""
+    colour = COLOURS.get(found.verdict, 36)
+    word = f"\x1b[1;{colour}m{found.verdict}\x1b[0m" if sys.stdout.isatty() else found.verdict
+    step = found.step
+    worst = next((judgement for judgement in found.verdicts if judgement.verdict == found.verdict), None)
+    why = f"{worst.norm}{', ' if worst.clause else ''}{worst.clause}: {worst.reason}" if worst else "no norm was asked"
+    print(f"{word}   {why}")
+    if step is not None:
+        histogram = "" if step.histogram is None else f", paper's histogram {step.histogram.step_mm:.3f} mm"
+        print(
+            f"       largest step {step.max_abs_mm:.3f} ± {step.expanded_uncertainty_mm:.3f} mm (k = 2) "
+            f"at {step.max_abs_at_deg:.0f}°, mean {step.mean_mm:.3f} mm{histogram}"
+        )
+    for judgement in found.verdicts:
+        if judgement is not worst:
+            print(f"       {judgement.verdict} by {judgement.norm}, {judgement.clause}: {judgement.reason}")
+    for shot, reason in found.left_out:
+        print(f"       left out {shot}: {reason}")
+    for warning in found.warnings:
+        print(f"       note: {warning}")
+    print(f"       report: {out / 'report.html'}")
+
+
+def _is_demo(folder: Path) -> bool:
+    """Whether a folder is an earlier demo and holds nothing else."""
+    from weldscan.report import is_result
+
+    names = {entry.name for entry in folder.iterdir()}
+    if not names or not names <= {"session", "report"}:
+        return False
+    files = {entry.name for entry in (folder / "session").iterdir()} if "session" in names else {"session.json"}
+    known = {"session.json", "shots", "truth.json", "touch.csv"}
+    return "session.json" in files and files <= known and ("report" not in names or is_result(folder / "report"))
+
+
+@contextmanager
+def _progress() -> Iterator[Progress]:
+    """Shows how far it is: a bar on a terminal, JSON lines otherwise; on stderr in both cases."""
+    if not sys.stderr.isatty():
+
+        def tell(done: int, total: int, what: str) -> None:
+            print(json.dumps({"done": done, "of": total, "what": what}), file=sys.stderr, flush=True)
+
+        yield tell
+        return
+
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description:34}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
+    with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True) as bars:
+        bar = bars.add_task("", total=None)
+
+        def show(done: int, total: int, what: str) -> None:
+            bars.update(bar, completed=done, total=total, description=what)
+
+        yield show
+
+
+def main() -> None:
+    """The entry point: whatever happens, one line and the exit code of the contract."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        code = _complain("interrupted; nothing was written", INTERRUPTED)
+    except NotMeasured as error:
+        code = _complain(error, EXIT_CODES[Verdict.NOT_MEASURED])
+    except WeldscanError as error:
+        code = _complain(error, BAD_INPUT)
+    except BrokenPipeError:
+        # Whoever read our output went away; Python would complain once more while it closes stdout.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = OUR_FAULT
+    except Exception as error:
+        if os.environ.get("WELDSCAN_TRACEBACK"):
+            traceback.print_exc()
+        code = _complain(
+            f"an error of weldscan itself: {type(error).__name__}: {error} (WELDSCAN_TRACEBACK=1 shows where)",
+            OUR_FAULT,
+        )
+    else:
+        return
+    sys.exit(code)
+
+
+def _complain(message: object, code: int) -> int:
+    print(f"weldscan: {' '.join(str(message).split())}", file=sys.stderr)
+    return code

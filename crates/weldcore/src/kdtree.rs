@@ -26,6 +26,10 @@ const QUERIES: usize = 1024;
 pub const LARGEST_COORDINATE: f64 = 1e150;
 /// No neighbour yet: every real one is nearer.
 const FAR: f64 = f64::MAX;
+/// Not a place.
+const NOWHERE: u32 = u32::MAX;
+/// Some units in the last place, relative: far more than a distance is off by.
+const ROUNDING: f64 = 64.0 * f64::EPSILON;
 /// Levels that 2³² points need, each with at most `WIDTH - 1` children put aside.
 const DEEPEST: usize = 11 * (WIDTH - 1) + 1;
 
@@ -67,12 +71,12 @@ impl KdTree {
     ///
     /// # Errors
     /// [`Error::TooFew`] for no points, [`Error::NonFinite`], and [`Error::OutOfRange`] for coordinates beyond
-    /// [`LARGEST_COORDINATE`] or 2³² - 1 points and more.
+    /// [`LARGEST_COORDINATE`] or about 2³² points and more.
     pub fn new(points: &[[f64; 3]]) -> Result<Self> {
         let what = "points";
         require_count(what, 1, points.len())?;
         require_range(what, points)?;
-        if u32::try_from(points.len()).is_err() {
+        if u32::try_from(points.len() + WIDTH).is_err() {
             let expected = "fewer than 2^32 points".into();
             return Err(Error::OutOfRange { what, expected, value: points.len().to_string() });
         }
@@ -193,6 +197,35 @@ impl KdTree {
         Ok(chunks.into_iter().flatten().collect())
     }
 
+    /// The point in a place of the tree's own order, and its index.
+    #[inline(always)]
+    pub(crate) fn in_place(&self, place: u32) -> ([f64; 3], u32) {
+        let (leaf, i) = (place as usize / WIDTH, place as usize % WIDTH);
+        (self.leaves[leaf].0.map(|row| row[i]), self.indices[leaf][i])
+    }
+
+    /// The place of the nearest point to `q`, and the squared distance. Starts from what `step` knows of the last query:
+    /// a query that has moved by less than half of the lead of its nearest point over the second nearest needs no search.
+    #[inline(always)]
+    pub(crate) fn follow(&self, q: &[f64; 3], step: &mut Step, aside: &mut Aside) -> (f64, u32) {
+        let mut found = NearestTwo { squared: FAR, second: FAR, index: u32::MAX, place: 0 };
+        if step.place == NOWHERE {
+            self.dive(q, &mut found);
+        } else {
+            let (p, index) = self.in_place(step.place);
+            let squared = squared_distance(&p, q);
+            if 2.0 * squared_distance(&step.at, q).sqrt() < step.lead {
+                return (squared, step.place);
+            }
+            found.offer(squared, index, step.place);
+        }
+        self.search(q, aside, &mut found);
+        let (first, second) = (found.squared.sqrt(), found.second.sqrt());
+        // Less what rounding could make of the distances compared.
+        *step = Step { at: *q, lead: second - first - ROUNDING * second, place: found.place };
+        (found.squared, found.place)
+    }
+
     /// The search that all others share: offers every point that may be nearer than `found.bound()`, near boxes first.
     #[inline(always)]
     fn search(&self, q: &[f64; 3], aside: &mut Aside, found: &mut impl Found) {
@@ -258,6 +291,35 @@ impl KdTree {
     }
 }
 
+/// Nearest neighbours of queries that move a little from call to call, as the points of an iteration do.
+///
+/// It remembers for each query by how much its nearest point is nearer than the second nearest: as long as the query
+/// moves by less than half of that, the answer stands without a search. Answers are those of [`KdTree::nearest`].
+#[derive(Clone, Default)]
+pub struct Follower(Vec<Step>);
+
+impl Follower {
+    /// As [`KdTree::nearest`]. The queries are taken for those of the last call, moved; another number of them starts anew.
+    ///
+    /// # Errors
+    /// As [`KdTree::nearest`].
+    pub fn nearest(&mut self, tree: &KdTree, queries: &[[f64; 3]]) -> Result<(Vec<f64>, Vec<u32>)> {
+        require_range("queries", queries)?;
+        let places = u32::try_from(tree.leaves.len() * WIDTH).unwrap_or(u32::MAX);
+        if self.0.len() != queries.len() || self.0.iter().any(|s| s.place != NOWHERE && s.place >= places) {
+            self.0 = vec![Step::NEW; queries.len()];
+        }
+        let (mut distance, mut index) = (vec![0.0; queries.len()], vec![0; queries.len()]);
+        threads::install(|| {
+            let answers = (distance.par_chunks_mut(QUERIES), index.par_chunks_mut(QUERIES));
+            (queries.par_chunks(QUERIES), self.0.par_chunks_mut(QUERIES), answers.0, answers.1)
+                .into_par_iter()
+                .for_each(|(queries, steps, distance, index)| follow_all(tree, queries, steps, distance, index));
+        });
+        Ok((distance, index))
+    }
+}
+
 impl std::fmt::Debug for KdTree {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "KdTree({} points)", self.len)
@@ -274,10 +336,10 @@ pub struct Within {
 }
 
 /// Boxes put aside during a search: squared distance, level, node.
-struct Aside([(f64, u32, u32); DEEPEST]);
+pub(crate) struct Aside([(f64, u32, u32); DEEPEST]);
 
 impl Aside {
-    fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Self([(0.0, 0, 0); DEEPEST])
     }
 }
@@ -307,6 +369,49 @@ impl Found for Nearest {
             (self.squared, self.index) = (squared, index);
         }
     }
+}
+
+/// The nearest, and how far the second nearest is.
+struct NearestTwo {
+    squared: f64,
+    second: f64,
+    index: u32,
+    place: u32,
+}
+
+impl Found for NearestTwo {
+    #[inline(always)]
+    fn bound(&self) -> f64 {
+        self.second
+    }
+
+    #[inline(always)]
+    fn offer(&mut self, squared: f64, index: u32, place: u32) {
+        if place == self.place && self.index != u32::MAX {
+            return;
+        }
+        if squared < self.squared || (squared == self.squared && index < self.index) {
+            self.second = self.squared;
+            (self.squared, self.index, self.place) = (squared, index, place);
+        } else if squared < self.second {
+            self.second = squared;
+        }
+    }
+}
+
+/// What is known of a query that moves a little at a time.
+#[derive(Clone, Copy)]
+pub(crate) struct Step {
+    /// Where it was when it was last searched.
+    at: [f64; 3],
+    /// How much nearer its nearest point was than the second nearest, mm.
+    lead: f64,
+    place: u32,
+}
+
+impl Step {
+    /// Of a query that was never searched.
+    pub(crate) const NEW: Self = Self { at: [0.0; 3], lead: 0.0, place: NOWHERE };
 }
 
 /// The `k` nearest, ascending.
@@ -370,6 +475,15 @@ fn nearest_of(tree: &KdTree, queries: &[[f64; 3]], distance: &mut [f64], index: 
         tree.dive(q, &mut found);
         tree.search(q, &mut aside, &mut found);
         (*distance, *index) = (found.squared.sqrt(), found.index);
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
+fn follow_all(tree: &KdTree, queries: &[[f64; 3]], steps: &mut [Step], distance: &mut [f64], index: &mut [u32]) {
+    let mut aside = Aside::new();
+    for (((q, step), distance), index) in queries.iter().zip(steps).zip(distance).zip(index) {
+        let (squared, place) = tree.follow(q, step, &mut aside);
+        (*distance, *index) = (squared.sqrt(), tree.in_place(place).1);
     }
 }
 
@@ -466,6 +580,12 @@ fn min(a: f64, b: f64) -> f64 {
 #[inline(always)]
 fn max(a: f64, b: f64) -> f64 {
     if a > b { a } else { b }
+}
+
+#[inline(always)]
+fn squared_distance(p: &[f64; 3], q: &[f64; 3]) -> f64 {
+    let (x, y, z) = (p[0] - q[0], p[1] - q[1], p[2] - q[2]);
+    (x * x + y * y) + z * z
 }
 
 /// The lowest of eight and its place.
@@ -636,6 +756,21 @@ mod tests {
             .collect();
         threads::set_threads(None).unwrap();
         assert!(answers.windows(2).all(|w| w[0] == w[1]));
+    }
+
+    #[test]
+    fn followed_queries_get_the_answers_of_a_search() {
+        let mut points = random(3_000, 7, 20.0, 0.0);
+        points.extend_from_within(..500);
+        let tree = KdTree::new(&points).unwrap();
+        let (mut queries, shifts) = (random(2_000, 8, 20.0, 0.0), random(2_000, 9, 2.0, -1.0));
+        let mut follower = Follower::default();
+        for round in 0..12 {
+            assert_eq!(follower.nearest(&tree, &queries).unwrap(), tree.nearest(&queries).unwrap());
+            for (q, shift) in queries.iter_mut().zip(&shifts) {
+                *q = std::array::from_fn(|k| q[k] + shift[k] * 0.5f64.powi(round));
+            }
+        }
     }
 
     #[test]

@@ -6,14 +6,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from weldscan._weldcore import (
+    Cylinder,
     FoundSphere,
     KdTree,
     Lens,
+    Plane,
+    Registration,
     RigidFit,
     Scanner,
     SimulatedShot,
+    Sphere,
+    WeakDirection,
     __version__,
     find_spheres,
+    register_icp,
     register_rigid,
     set_threads,
     simulate_shot,
@@ -52,6 +58,7 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
+    "Cylinder",
     "DeviceError",
     "DeviceTimeout",
     "FoundSphere",
@@ -61,10 +68,14 @@ __all__ = [
     "KukaPose",
     "Lens",
     "NotMeasured",
+    "Plane",
+    "Registration",
     "RigidFit",
     "Scanner",
     "Session",
     "SimulatedShot",
+    "Sphere",
+    "WeakDirection",
     "WeldscanError",
     "__version__",
     "find_spheres",
@@ -82,6 +93,7 @@ __all__ = [
     "parse_frame",
     "read_frames",
     "read_session",
+    "register_icp",
     "register_rigid",
     "set_threads",
     "simulate_shot",

@@ -1,19 +1,25 @@
 # The Rust core as Python sees it. One section per room, in the order of the flow.
 from collections.abc import Sequence
-from typing import Any, final
+from typing import Any, Literal, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
+    "Cylinder",
     "FoundSphere",
     "KdTree",
     "Lens",
+    "Plane",
+    "Registration",
     "RigidFit",
     "Scanner",
     "SimulatedShot",
+    "Sphere",
+    "WeakDirection",
     "__version__",
     "find_spheres",
+    "register_icp",
     "register_rigid",
     "set_threads",
     "simulate_shot",
@@ -125,3 +131,78 @@ class FoundSphere:
     def free_radius_sigma_mm(self) -> float: ...
 
 def find_spheres(points: ArrayLike, radius_mm: float, count: int | None = None) -> list[FoundSphere]: ...
+
+# distance
+@final
+class Plane:
+    def __new__(cls, point_mm: ArrayLike, normal: ArrayLike) -> Plane: ...
+    @property
+    def point_mm(self) -> NDArray[np.float64]: ...
+    @property
+    def normal(self) -> NDArray[np.float64]: ...
+
+@final
+class Sphere:
+    def __new__(cls, center_mm: ArrayLike, radius_mm: float) -> Sphere: ...
+    @property
+    def center_mm(self) -> NDArray[np.float64]: ...
+    @property
+    def radius_mm(self) -> float: ...
+
+@final
+class Cylinder:
+    def __new__(cls, point_mm: ArrayLike, axis: ArrayLike, radius_mm: float) -> Cylinder: ...
+    @property
+    def point_mm(self) -> NDArray[np.float64]: ...
+    @property
+    def axis(self) -> NDArray[np.float64]: ...
+    @property
+    def radius_mm(self) -> float: ...
+
+# icp
+@final
+class WeakDirection:
+    @property
+    def kind(self) -> Literal["translation", "rotation", "screw"]: ...
+    @property
+    def axis(self) -> NDArray[np.float64]: ...
+    @property
+    def point_mm(self) -> NDArray[np.float64] | None: ...
+    @property
+    def strength(self) -> float: ...
+    @property
+    def vector(self) -> NDArray[np.float64]: ...
+
+@final
+class Registration:
+    @property
+    def target_from_source(self) -> NDArray[np.float64]: ...
+    @property
+    def converged(self) -> bool: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def rms_mm(self) -> float: ...
+    @property
+    def inliers(self) -> NDArray[np.uint32]: ...
+    @property
+    def covariance(self) -> NDArray[np.float64]: ...
+    @property
+    def unobserved(self) -> list[WeakDirection]: ...
+
+def register_icp(
+    source: ArrayLike,
+    target: ArrayLike | KdTree | Plane | Sphere | Cylinder,
+    metric: Literal["point", "plane"] = "point",
+    *,
+    normals: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+    max_distance_mm: float = ...,
+    trim: float = 0.0,
+    kernel: Literal["huber", "tukey"] | None = None,
+    kernel_mm: float | None = None,
+    max_iterations: int = 100,
+    tolerance_mm: float = 1e-7,
+    weak: float = 0.01,
+    max_points: int | None = None,
+) -> Registration: ...

@@ -7,7 +7,9 @@ use numpy::{PyArray, PyArrayMethods, PyReadonlyArray, PyReadonlyArray2, PyUntype
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
+mod distance;
 mod fit;
+mod icp;
 mod kdtree;
 mod scanner;
 mod simulate;
@@ -115,6 +117,8 @@ fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
     scanner::register(m)?;
     kdtree::register(m)?;
     transform::register(m)?;
+    distance::register(m)?;
+    icp::register(m)?;
     simulate::register(m)?;
     Ok(())
 }

@@ -139,8 +139,8 @@ def inspection(
             "ok": (ok := int(share * pixels)),
             "dark": (dark := int(0.8 * (pixels - ok))),
             "saturated": (saturated := int(0.1 * (pixels - ok))),
-            "fringe order in doubt": pixels - ok - dark - saturated - 100,
-            "no fit": 100,
+            "order_in_doubt": pixels - ok - dark - saturated - 100,
+            "no_fit": 100,
         }
         for kind, count, share in (("artefact", 6, 0.41), ("part", 2, 0.63))
         for index in range(count)

@@ -344,7 +344,7 @@ def _matrix(hand_eye: HandEye | None) -> str:
     )
 
 
-MASKS = ("ok", "dark", "saturated", "fringe order in doubt", "no fit")
+MASKS = ("ok", "dark", "saturated", "order in doubt", "no fit")
 BARS = ("ok", "dark", "saturated", "doubt", "nofit")
 
 

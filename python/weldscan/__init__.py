@@ -6,10 +6,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from weldscan._weldcore import (
+    Cloud,
     Cylinder,
     FoundSphere,
     KdTree,
     Lens,
+    PhaseMap,
     Plane,
     Registration,
     RigidFit,
@@ -18,12 +20,14 @@ from weldscan._weldcore import (
     Sphere,
     WeakDirection,
     __version__,
+    decode,
     find_spheres,
     register_icp,
     register_rigid,
     set_threads,
     simulate_shot,
     simulated_step,
+    triangulate,
 )
 from weldscan.errors import DeviceError, DeviceTimeout, GeometryError, InputError, NotMeasured, WeldscanError
 from weldscan.pose import (
@@ -58,6 +62,7 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
+    "Cloud",
     "Cylinder",
     "DeviceError",
     "DeviceTimeout",
@@ -68,6 +73,7 @@ __all__ = [
     "KukaPose",
     "Lens",
     "NotMeasured",
+    "PhaseMap",
     "Plane",
     "Registration",
     "RigidFit",
@@ -78,6 +84,7 @@ __all__ = [
     "WeakDirection",
     "WeldscanError",
     "__version__",
+    "decode",
     "find_spheres",
     "format_e6axis",
     "format_e6pos",
@@ -98,5 +105,6 @@ __all__ = [
     "set_threads",
     "simulate_shot",
     "simulated_step",
+    "triangulate",
     "write_session",
 ]

@@ -6,10 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
+    "Cloud",
     "Cylinder",
     "FoundSphere",
     "KdTree",
     "Lens",
+    "PhaseMap",
     "Plane",
     "Registration",
     "RigidFit",
@@ -18,12 +20,14 @@ __all__ = [
     "Sphere",
     "WeakDirection",
     "__version__",
+    "decode",
     "find_spheres",
     "register_icp",
     "register_rigid",
     "set_threads",
     "simulate_shot",
     "simulated_step",
+    "triangulate",
 ]
 
 __version__: str
@@ -58,6 +62,53 @@ class Scanner:
     @property
     def baseline_mm(self) -> float: ...
     def project_to_projector(self, points: ArrayLike) -> NDArray[np.float64]: ...
+
+# phase
+@final
+class PhaseMap:
+    @property
+    def column_px(self) -> NDArray[np.float64]: ...
+    @property
+    def sigma_px(self) -> NDArray[np.float32]: ...
+    @property
+    def modulation(self) -> NDArray[np.float32]: ...
+    @property
+    def background(self) -> NDArray[np.float32]: ...
+    @property
+    def reason(self) -> NDArray[np.uint8]: ...
+    @property
+    def counts(self) -> list[int]: ...
+    @property
+    def noise_read_variance(self) -> float: ...
+    @property
+    def noise_gain(self) -> float: ...
+    @property
+    def noise_source(self) -> str: ...
+    @property
+    def saturation(self) -> float: ...
+    @property
+    def harmonics(self) -> list[float | None]: ...
+    @property
+    def unwrapped_by(self) -> list[float]: ...
+
+def decode(
+    exposures: Sequence[Sequence[NDArray[Any]] | NDArray[Any]] | NDArray[Any],
+    fringes: Sequence[tuple[float, int]],
+    projector_size: int,
+    *,
+    saturation: float | None = None,
+    z: float = 5.0,
+) -> PhaseMap: ...
+
+# triangulate
+@final
+class Cloud:
+    @property
+    def points_mm(self) -> NDArray[np.float64]: ...
+    @property
+    def sigma_mm(self) -> NDArray[np.float32] | None: ...
+
+def triangulate(column: ArrayLike, scanner: Scanner, sigma_px: ArrayLike | None = None, axis: str = "x") -> Cloud: ...
 
 # kdtree
 @final

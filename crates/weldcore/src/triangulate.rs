@@ -1,1 +1,315 @@
-//! (to be written)
+//! From the projector's column to points.
+//!
+//! A camera pixel is a ray `z (x, y, 1)`; a projector column is a surface, a plane but for the projector's lens. In the
+//! projector's frame the ray at `s = 1/z` is seen in the direction `((q + s t) / (q_z + s t_z))`, with q the rotated
+//! ray and t the camera's place: one unknown, found by Newton on the distorted column, exactly with both lenses. The
+//! start is the plane without the lens.
+
+use multiversion::multiversion;
+use rayon::prelude::*;
+
+use crate::error::{Error, Result};
+use crate::scanner::{Lens, Rays, Scanner};
+use crate::threads::{self, CHUNK};
+
+/// Pixels that the kernel takes at a time.
+const TILE: usize = 128;
+/// Newton doubles the digits: from the 1e-2 of a strong lens to the last digit takes four steps. Where it has not come down to this (normalised coordinates) the ray does not meet the column.
+const CONVERGED: f64 = 1e-11;
+
+/// Which way the fringes run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Axis {
+    /// Along x: the phase gives the projector's column.
+    X,
+    /// Along y: the phase gives the projector's row.
+    Y,
+}
+
+/// Points on the camera's pixel grid.
+#[derive(Debug, Clone)]
+pub struct Cloud {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Scanner frame, mm; NaN where there is none.
+    pub points_mm: Vec<[f64; 3]>,
+    /// Standard deviation along the camera's ray; NaN where there is no point. Empty if none was asked for.
+    pub sigma_mm: Vec<f32>,
+}
+
+/// The numbers of a tile's problem, the projector turned so that the measured coordinate is the first.
+struct Problem {
+    /// Rows of projector_from_camera's rotation, measured coordinate first, then the other, then z; and its translation.
+    rotation: [[f64; 3]; 3],
+    translation: [f64; 3],
+    k: [f64; 3],
+    /// Tangential terms: p[0] belongs to the measured coordinate.
+    p: [f64; 2],
+    focal: [f64; 2],
+    centre: [f64; 2],
+    size: [f64; 2],
+}
+
+impl Problem {
+    fn new(scanner: &Scanner, axis: Axis) -> Self {
+        let pose = scanner.camera_from_projector.inverse();
+        let row = |r: usize| [pose.rotation[(r, 0)], pose.rotation[(r, 1)], pose.rotation[(r, 2)]];
+        let Lens { width, height, fx, fy, cx, cy, dist: [k1, k2, p1, p2, k3] } = scanner.projector;
+        let (first, second) = match axis {
+            Axis::X => (0, 1),
+            Axis::Y => (1, 0),
+        };
+        let swap = |a: f64, b: f64| if axis == Axis::X { [a, b] } else { [b, a] };
+        let t = pose.translation;
+        Self {
+            rotation: [row(first), row(second), row(2)],
+            translation: [t[first], t[second], t[2]],
+            k: [k1, k2, k3],
+            p: swap(p2, p1),
+            focal: swap(fx, fy),
+            centre: swap(cx, cy),
+            size: swap(width as f64, height as f64),
+        }
+    }
+}
+
+struct Tile {
+    x: [f64; TILE],
+    y: [f64; TILE],
+    column: [f64; TILE],
+    sigma_px: [f32; TILE],
+    z: [f64; TILE],
+    sigma_mm: [f32; TILE],
+}
+
+/// What the projector sees of a camera ray at s = 1/z.
+struct Look {
+    /// Measured coordinate less its aim, normalised and distorted; and its derivative by s.
+    miss: f64,
+    slope: f64,
+    /// The other coordinate.
+    across: f64,
+    /// Its distance from the projector, times s.
+    depth: f64,
+}
+
+impl Look {
+    #[inline(always)]
+    fn step(&self) -> f64 {
+        self.miss / self.slope
+    }
+}
+
+#[inline(always)]
+fn look(problem: &Problem, q: &[f64; 3], aim: f64, s: f64) -> Look {
+    let Problem { translation: t, k, p, .. } = problem;
+    let depth = q[2] + t[2] * s;
+    let inverse = 1.0 / depth;
+    let a = (q[0] + t[0] * s) * inverse;
+    let b = (q[1] + t[1] * s) * inverse;
+    // The lens, as in `Lens::distort`, and its slope along the ray.
+    let (aa, ab, bb) = (a * a, a * b, b * b);
+    let r2 = aa + bb;
+    let radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]));
+    let bend = 2.0 * (k[0] + r2 * (2.0 * k[1] + r2 * 3.0 * k[2]));
+    let along_a = radial + aa * bend + 2.0 * p[1] * b + 6.0 * p[0] * a;
+    let along_b = ab * bend + 2.0 * p[1] * a + 2.0 * p[0] * b;
+    Look {
+        miss: a * radial + 2.0 * p[1] * ab + p[0] * (r2 + 2.0 * aa) - aim,
+        slope: (along_a * (t[0] - a * t[2]) + along_b * (t[1] - b * t[2])) * inverse,
+        across: b * radial + p[1] * (r2 + 2.0 * bb) + 2.0 * p[0] * ab,
+        depth,
+    }
+}
+
+/// Depth along each ray, and its standard deviation.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+fn solve(problem: &Problem, tile: &mut Tile) {
+    let Problem { rotation: r, translation: t, focal, centre, size, .. } = problem;
+    for i in 0..TILE {
+        let (x, y) = (tile.x[i], tile.y[i]);
+        let q = [
+            r[0][0] * x + r[0][1] * y + r[0][2],
+            r[1][0] * x + r[1][1] * y + r[1][2],
+            r[2][0] * x + r[2][1] * y + r[2][2],
+        ];
+        let aim = (tile.column[i] - centre[0]) / focal[0];
+        let mut s = (aim * q[2] - q[0]) / (t[0] - aim * t[2]);
+        // Written out: the compiler makes vectors of a loop only where it holds no other.
+        s -= look(problem, &q, aim, s).step();
+        s -= look(problem, &q, aim, s).step();
+        s -= look(problem, &q, aim, s).step();
+        s -= look(problem, &q, aim, s).step();
+        let Look { miss, slope, across, depth } = look(problem, &q, aim, s);
+        let other = focal[1] * across + centre[1];
+        let column = tile.column[i];
+        let good = (miss.abs() < CONVERGED)
+            & (s > 0.0)
+            & (depth > 0.0)
+            & (column >= -0.5)
+            & (column <= size[0] - 0.5)
+            & (other >= -0.5)
+            & (other <= size[1] - 0.5);
+        let z = 1.0 / s;
+        // dz/dcolumn = -z² / (focal dmiss/ds), and along the ray times the length of (x, y, 1).
+        let per_px = z * z * (x * x + y * y + 1.0).sqrt() / (focal[0] * slope).abs();
+        tile.z[i] = if good { z } else { f64::NAN };
+        tile.sigma_mm[i] = if good { (f64::from(tile.sigma_px[i]) * per_px) as f32 } else { f32::NAN };
+    }
+}
+
+/// The point on each camera ray that the projector lights with this column (row for [`Axis::Y`]). Pixels without a
+/// column have no point, nor have those whose point would lie behind either device or outside the projector's image.
+///
+/// # Errors
+/// [`Error::Shape`] where the arrays do not have the camera's size.
+pub fn triangulate(column_px: &[f64], scanner: &Scanner, sigma_px: Option<&[f32]>, axis: Axis) -> Result<Cloud> {
+    let Lens { width, height, .. } = scanner.camera;
+    let n = width * height;
+    let lengths = [("column", Some(column_px.len())), ("sigma_px", sigma_px.map(<[f32]>::len))];
+    for (what, got) in lengths {
+        if let Some(got) = got.filter(|&got| got != n) {
+            let expected = format!("{n} pixels, the camera's {width} x {height}");
+            return Err(Error::Shape { what, expected, got: got.to_string() });
+        }
+    }
+    let problem = Problem::new(scanner, axis);
+    let rays = scanner.camera_rays();
+    let mut points_mm = vec![[0.0; 3]; n];
+    let mut sigma_mm = vec![0.0f32; if sigma_px.is_some() { n } else { 0 }];
+    threads::install(|| match sigma_px {
+        Some(sigma_px) => {
+            let out = points_mm.par_chunks_mut(CHUNK).zip(sigma_mm.par_chunks_mut(CHUNK)).enumerate();
+            out.for_each(|(i, (p, s))| chunk(&problem, &rays, column_px, Some(sigma_px), i * CHUNK, p, s));
+        }
+        None => {
+            let out = points_mm.par_chunks_mut(CHUNK).enumerate();
+            out.for_each(|(i, p)| chunk(&problem, &rays, column_px, None, i * CHUNK, p, &mut []));
+        }
+    });
+    Ok(Cloud { width, height, points_mm, sigma_mm })
+}
+
+fn chunk(
+    problem: &Problem,
+    rays: &Rays,
+    column: &[f64],
+    sigma_px: Option<&[f32]>,
+    start: usize,
+    points: &mut [[f64; 3]],
+    sigma_mm: &mut [f32],
+) {
+    let nan = [f64::NAN; TILE];
+    let mut tile = Tile { x: nan, y: nan, column: nan, sigma_px: [0.0; TILE], z: nan, sigma_mm: [0.0; TILE] };
+    for (i, points) in points.chunks_mut(TILE).enumerate() {
+        let len = points.len();
+        let range = start + i * TILE..start + i * TILE + len;
+        let fill = |to: &mut [f64; TILE], from: &[f64]| {
+            to.iter_mut().zip(from.get(range.clone()).unwrap_or_default()).for_each(|(t, f)| *t = *f);
+        };
+        fill(&mut tile.x, &rays.x);
+        fill(&mut tile.y, &rays.y);
+        fill(&mut tile.column, column);
+        if let Some(sigma) = sigma_px.and_then(|s| s.get(range.clone())) {
+            tile.sigma_px.iter_mut().zip(sigma).for_each(|(t, f)| *t = *f);
+        }
+        solve(problem, &mut tile);
+        for (j, point) in points.iter_mut().enumerate().take(TILE) {
+            let z = tile.z[j];
+            *point = [tile.x[j] * z, tile.y[j] * z, z];
+        }
+        if let Some(sigma) = sigma_mm.get_mut(i * TILE..i * TILE + len) {
+            sigma.iter_mut().zip(&tile.sigma_mm).for_each(|(s, t)| *s = *t);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Vec3;
+    use crate::scanner::tests::example;
+
+    /// A wavy wall that fills the view, as depth along the ray.
+    fn depth(u: usize, v: usize) -> f64 {
+        420.0 + 20.0 * (u as f64 / 40.0).sin() + 0.1 * v as f64
+    }
+
+    /// Columns (or rows) of the wall by projecting it.
+    fn scene(scanner: &Scanner, axis: Axis) -> (Vec<f64>, Vec<Option<Vec3>>) {
+        let rays = scanner.camera_rays();
+        let pose = scanner.camera_from_projector.inverse();
+        let point = |i: usize| {
+            let p = Vec3::new(rays.x[i], rays.y[i], 1.0) * depth(i % 320, i / 320);
+            let (u, v) = scanner.projector.project(&pose.apply(&p))?;
+            scanner.projector.contains(u, v).then_some((if axis == Axis::X { u } else { v }, p))
+        };
+        (0..320 * 240).map(|i| point(i).map_or((f64::NAN, None), |(c, p)| (c, Some(p)))).unzip()
+    }
+
+    #[test]
+    fn points_come_back_with_both_lenses() {
+        // Fringes along y need a baseline along y, too.
+        let mut scanner = example();
+        scanner.camera_from_projector.translation.y = 90.0;
+        for axis in [Axis::X, Axis::Y] {
+            let (column, truth) = scene(&scanner, axis);
+            let cloud = triangulate(&column, &scanner, None, axis).unwrap();
+            let mut seen = 0;
+            for (p, t) in cloud.points_mm.iter().zip(&truth) {
+                if let Some(t) = t {
+                    seen += 1;
+                    assert!((Vec3::from(*p) - t).norm() < 1e-8, "{axis:?}: {p:?} {t:?}");
+                } else {
+                    assert!(p[2].is_nan());
+                }
+            }
+            assert!(seen > 20_000, "{axis:?}: {seen}");
+        }
+    }
+
+    #[test]
+    fn sigma_is_the_difference_quotient() {
+        let scanner = example();
+        let (column, _) = scene(&scanner, Axis::X);
+        let h = 1e-4;
+        let moved: Vec<f64> = column.iter().map(|c| c + h).collect();
+        let sigma = vec![0.05f32; column.len()];
+        let a = triangulate(&column, &scanner, Some(&sigma), Axis::X).unwrap();
+        let b = triangulate(&moved, &scanner, None, Axis::X).unwrap();
+        let mut seen = 0;
+        for ((p, q), s) in a.points_mm.iter().zip(&b.points_mm).zip(&a.sigma_mm) {
+            let expected = 0.05 * (Vec3::from(*p) - Vec3::from(*q)).norm() / h;
+            if expected.is_finite() {
+                seen += 1;
+                assert!((f64::from(*s) - expected).abs() < 1e-3 * expected, "{s} {expected}");
+            }
+        }
+        assert!(seen > 20_000);
+    }
+
+    #[test]
+    fn behind_or_beside_is_no_point() {
+        let scanner = example();
+        for column in [f64::NAN, f64::INFINITY, -1.0, 912.0, 1e300] {
+            let cloud = triangulate(&vec![column; 320 * 240], &scanner, None, Axis::X).unwrap();
+            assert!(cloud.points_mm.iter().all(|p| p[2].is_nan()), "{column}");
+        }
+        assert!(matches!(triangulate(&[1.0], &scanner, None, Axis::X), Err(Error::Shape { .. })));
+    }
+
+    #[test]
+    fn the_same_bits_on_any_number_of_threads() {
+        let scanner = example();
+        let (column, _) = scene(&scanner, Axis::X);
+        let run = || triangulate(&column, &scanner, None, Axis::X).unwrap().points_mm;
+        let bits = |points: Vec<[f64; 3]>| points.into_iter().flatten().map(f64::to_bits).collect::<Vec<_>>();
+        crate::threads::set_threads(Some(1)).unwrap();
+        let one = bits(run());
+        crate::threads::set_threads(Some(3)).unwrap();
+        assert_eq!(one, bits(run()));
+        crate::threads::set_threads(None).unwrap();
+    }
+}

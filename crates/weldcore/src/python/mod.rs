@@ -11,9 +11,11 @@ mod distance;
 mod fit;
 mod icp;
 mod kdtree;
+mod phase;
 mod scanner;
 mod simulate;
 mod transform;
+mod triangulate;
 
 use crate::error::Error;
 use crate::transform::Transform;
@@ -115,6 +117,8 @@ fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(set_threads, m)?)?;
     fit::register(m)?;
     scanner::register(m)?;
+    phase::register(m)?;
+    triangulate::register(m)?;
     kdtree::register(m)?;
     transform::register(m)?;
     distance::register(m)?;

@@ -1,0 +1,288 @@
+//! Fitting a sinusoid to N samples of it, tile by tile.
+//!
+//! The loops run over tiles of [`TILE`] pixels held in plain arrays, so that the compiler makes vectors of them; each
+//! is compiled for AVX-512, AVX2 and the baseline, and the best is chosen at run time. None fuses a product with a
+//! sum: every version gives the same bits.
+
+use std::f64::consts::TAU;
+
+use multiversion::multiversion;
+
+/// Pixels that a kernel takes at a time: all of its arrays stay in the first-level cache.
+pub(crate) const TILE: usize = 256;
+
+/// One number per pixel of a tile.
+pub(crate) type Lane = [f32; TILE];
+
+/// A grey level as cameras deliver it.
+pub trait Level: Copy + Send + Sync + Default + Into<f32> + Into<f64> + Into<u32> + 'static {
+    /// The largest value that the type holds.
+    const FULL: u32;
+    #[doc(hidden)]
+    fn demodulate(frames: &[&[Self; TILE]], wave: &Wave, out: &mut Sinusoid);
+}
+
+impl Level for u8 {
+    const FULL: u32 = 255;
+    fn demodulate(frames: &[&[Self; TILE]], wave: &Wave, out: &mut Sinusoid) {
+        demodulate_u8(frames, wave, out);
+    }
+}
+
+impl Level for u16 {
+    const FULL: u32 = 65_535;
+    fn demodulate(frames: &[&[Self; TILE]], wave: &Wave, out: &mut Sinusoid) {
+        demodulate_u16(frames, wave, out);
+    }
+}
+
+/// cos and sin of delta_k = 2πk/N.
+#[doc(hidden)]
+#[derive(Debug, Clone)]
+pub struct Wave {
+    pub cos: Vec<f64>,
+    pub sin: Vec<f64>,
+    cos32: Vec<f32>,
+    sin32: Vec<f32>,
+}
+
+impl Wave {
+    pub(crate) fn new(steps: usize) -> Self {
+        let exact = |v: f64| if v.abs() < 1e-15 { 0.0 } else { v };
+        let delta = |k: usize| TAU * k as f64 / steps as f64;
+        let cos: Vec<f64> = (0..steps).map(|k| exact(delta(k).cos())).collect();
+        let sin: Vec<f64> = (0..steps).map(|k| exact(delta(k).sin())).collect();
+        let narrow = |v: &[f64]| v.iter().map(|&x| x as f32).collect();
+        Self { cos32: narrow(&cos), sin32: narrow(&sin), cos, sin }
+    }
+}
+
+/// What N samples of a sinusoid say of a tile: `I_k = background + modulation cos(phi - delta_k)`.
+#[doc(hidden)]
+#[derive(Debug)]
+pub struct Sinusoid {
+    /// (2/N) ΣI cos = modulation cos(phi).
+    pub re: Lane,
+    /// (2/N) ΣI sin = modulation sin(phi).
+    pub im: Lane,
+    /// Mean level.
+    pub background: Lane,
+    /// Sum of the squared residuals.
+    pub rest: Lane,
+    /// The highest level.
+    pub top: Lane,
+}
+
+impl Sinusoid {
+    pub(crate) fn empty() -> Self {
+        let zero = [0.0; TILE];
+        Self { re: zero, im: zero, background: zero, rest: zero, top: zero }
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+fn demodulate_u8(frames: &[&[u8; TILE]], wave: &Wave, out: &mut Sinusoid) {
+    demodulate(frames, wave, out);
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+fn demodulate_u16(frames: &[&[u16; TILE]], wave: &Wave, out: &mut Sinusoid) {
+    demodulate(frames, wave, out);
+}
+
+/// The usual numbers of steps keep all samples of a pixel in registers; the rest go frame by frame.
+#[inline(always)]
+fn demodulate<T: Level>(frames: &[&[T; TILE]], wave: &Wave, out: &mut Sinusoid) {
+    match frames.len() {
+        3 => demodulate_fixed::<T, 3>(frames, wave, out),
+        4 => demodulate_fixed::<T, 4>(frames, wave, out),
+        5 => demodulate_fixed::<T, 5>(frames, wave, out),
+        6 => demodulate_fixed::<T, 6>(frames, wave, out),
+        8 => demodulate_fixed::<T, 8>(frames, wave, out),
+        _ => demodulate_any(frames, wave, out),
+    }
+}
+
+#[inline(always)]
+fn demodulate_fixed<T: Level, const N: usize>(frames: &[&[T; TILE]], wave: &Wave, out: &mut Sinusoid) {
+    let (Ok(frames), Ok(cos), Ok(sin)) = (
+        <&[&[T; TILE]; N]>::try_from(frames),
+        <&[f32; N]>::try_from(wave.cos32.as_slice()),
+        <&[f32; N]>::try_from(wave.sin32.as_slice()),
+    ) else {
+        return;
+    };
+    let (half, mean) = (2.0 / N as f32, 1.0 / N as f32);
+    for i in 0..TILE {
+        let (mut re, mut im, mut sum, mut top) = (0.0f32, 0.0f32, 0.0f32, 0.0f32);
+        for k in 0..N {
+            let v: f32 = frames[k][i].into();
+            re += v * cos[k];
+            im += v * sin[k];
+            sum += v;
+            top = if v > top { v } else { top };
+        }
+        let (re, im, background) = (re * half, im * half, sum * mean);
+        let mut rest = 0.0f32;
+        if N > 3 {
+            for k in 0..N {
+                let v: f32 = frames[k][i].into();
+                let miss = v - background - (re * cos[k] + im * sin[k]);
+                rest += miss * miss;
+            }
+        }
+        out.re[i] = re;
+        out.im[i] = im;
+        out.background[i] = background;
+        out.rest[i] = rest;
+        out.top[i] = top;
+    }
+}
+
+#[inline(always)]
+fn demodulate_any<T: Level>(frames: &[&[T; TILE]], wave: &Wave, out: &mut Sinusoid) {
+    let n = frames.len() as f32;
+    *out = Sinusoid::empty();
+    for ((frame, &cos), &sin) in frames.iter().zip(&wave.cos32).zip(&wave.sin32) {
+        for i in 0..TILE {
+            let v: f32 = frame[i].into();
+            out.re[i] += v * cos;
+            out.im[i] += v * sin;
+            out.background[i] += v;
+            out.top[i] = if v > out.top[i] { v } else { out.top[i] };
+        }
+    }
+    for i in 0..TILE {
+        out.re[i] *= 2.0 / n;
+        out.im[i] *= 2.0 / n;
+        out.background[i] /= n;
+    }
+    for ((frame, &cos), &sin) in frames.iter().zip(&wave.cos32).zip(&wave.sin32) {
+        for i in 0..TILE {
+            let v: f32 = frame[i].into();
+            let miss = v - out.background[i] - (out.re[i] * cos + out.im[i] * sin);
+            out.rest[i] += miss * miss;
+        }
+    }
+}
+
+/// atan2(y, x) / 2π to 3e-8; 0 at the origin. Branch-free: the smaller of |x| and |y| over the larger, shifted by 45°
+/// where that lies beyond tan 22.5°, then an odd polynomial through Chebyshev points.
+#[inline(always)]
+pub(crate) fn turns(y: f32, x: f32) -> f32 {
+    let (ax, ay) = (x.abs(), y.abs());
+    let (large, small) = if ax > ay { (ax, ay) } else { (ay, ax) };
+    let far = small > 0.414_213_57 * large;
+    let above = if far { small - large } else { small };
+    let below = if far { small + large } else { large };
+    let q = above / (if below > 0.0 { below } else { 1.0 });
+    let z = q * q;
+    let p = 3.178_972_8e-2 + z * (-2.204_043_7e-2 + z * 1.269_426_5e-2);
+    let p = q * (0.159_154_94 + z * (-5.305_077_6e-2 + z * p));
+    let p = if far { p + 0.125 } else { p };
+    let p = if ay > ax { 0.25 - p } else { p };
+    let p = if x.is_sign_negative() { 0.5 - p } else { p };
+    p.copysign(y)
+}
+
+/// atan2(y, x) to 4e-16, as [`turns`].
+#[inline(always)]
+#[allow(dead_code)]
+pub(crate) fn atan2(y: f64, x: f64) -> f64 {
+    const TERMS: [f64; 11] = [
+        1.0,
+        -0.333_333_333_333_284_35,
+        0.199_999_999_988_544_29,
+        -0.142_857_141_809_171_9,
+        0.111_111_061_779_333_73,
+        -0.090_907_730_142_858_7,
+        0.076_899_526_223_186_42,
+        -0.066_402_261_887_265_36,
+        0.056_883_080_900_218_03,
+        -0.043_479_319_371_411_9,
+        0.021_133_886_187_624_962,
+    ];
+    let (ax, ay) = (x.abs(), y.abs());
+    let (large, small) = if ax > ay { (ax, ay) } else { (ay, ax) };
+    let far = small > 0.414_213_562_373_095_03 * large;
+    let above = if far { small - large } else { small };
+    let below = if far { small + large } else { large };
+    let q = above / (if below > 0.0 { below } else { 1.0 });
+    let z = q * q;
+    let mut p = 0.0;
+    for term in TERMS.iter().rev() {
+        p = p * z + term;
+    }
+    let p = q * p;
+    let p = if far { p + std::f64::consts::FRAC_PI_4 } else { p };
+    let p = if ay > ax { std::f64::consts::FRAC_PI_2 - p } else { p };
+    let p = if x.is_sign_negative() { std::f64::consts::PI - p } else { p };
+    p.copysign(y)
+}
+
+/// The nearest whole number, for |x| < 2²². Written as a sum, for the baseline has no instruction to round with.
+#[inline(always)]
+pub(crate) fn round(x: f32) -> f32 {
+    const SHIFT: f32 = 12_582_912.0;
+    (x + SHIFT) - SHIFT
+}
+
+/// The nearest whole number, for |x| < 2⁵¹.
+#[inline(always)]
+#[allow(dead_code)]
+pub(crate) fn round64(x: f64) -> f64 {
+    const SHIFT: f64 = 6_755_399_441_055_744.0;
+    (x + SHIFT) - SHIFT
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn arctangents_are_those_of_the_standard_library(x in -300.0..300.0f64, y in -300.0..300.0f64) {
+            prop_assert!((atan2(y, x) - y.atan2(x)).abs() < 9e-16);
+            let exact = y.atan2(x) / TAU;
+            prop_assert!((f64::from(turns(y as f32, x as f32)) - exact).abs() < 5e-8 + 1e-7 / (x.abs() + y.abs()));
+        }
+
+        #[test]
+        fn rounding_is_to_the_nearest(x in -1000.0..1000.0f32) {
+            prop_assert_eq!(round(x), x.round_ties_even());
+            prop_assert_eq!(round64(f64::from(x)), f64::from(x).round_ties_even());
+        }
+    }
+
+    #[test]
+    fn axes_and_origin() {
+        for (y, x, t) in [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.25), (0.0, -1.0, 0.5), (-1.0, 0.0, -0.25)] {
+            assert_eq!(turns(y, x), t);
+            assert!((atan2(f64::from(y), f64::from(x)) - f64::from(t) * TAU).abs() < 4e-16);
+        }
+    }
+
+    #[test]
+    fn any_number_of_steps_gives_back_the_sinusoid() {
+        for steps in 3..14 {
+            let wave = Wave::new(steps);
+            let level = |i: usize, k: usize| {
+                let (cos, sin) = (wave.cos[k], wave.sin[k]);
+                let phi = i as f64 / 40.0 - 3.0;
+                (30_000.0 + 20_000.0 * (phi.cos() * cos + phi.sin() * sin)).round() as u16
+            };
+            let frames: Vec<[u16; TILE]> = (0..steps).map(|k| std::array::from_fn(|i| level(i, k))).collect();
+            let mut out = Sinusoid::empty();
+            u16::demodulate(&frames.iter().collect::<Vec<_>>(), &wave, &mut out);
+            for i in 0..TILE {
+                let phi = i as f64 / 40.0 - 3.0;
+                assert!((f64::from(out.re[i]) - 20_000.0 * phi.cos()).abs() < 0.6);
+                assert!((f64::from(out.im[i]) - 20_000.0 * phi.sin()).abs() < 0.6);
+                assert!((f64::from(out.background[i]) - 30_000.0).abs() < 0.6);
+                assert!(out.rest[i] < 0.3 * steps as f32);
+                assert_eq!(f64::from(out.top[i]), f64::from((0..steps).map(|k| level(i, k)).max().unwrap()));
+            }
+        }
+    }
+}

@@ -23,6 +23,12 @@ $(VENV)/.built-$(PROFILE): $(VENV)/.tools $(RUST) pyproject.toml
 	@VIRTUAL_ENV=$(abspath $(VENV)) $(BIN)/maturin develop --quiet --locked --profile $(PROFILE)
 	@rm -f $(VENV)/.built-* && touch $@
 
+$(VENV)/.peers: requirements-peers.txt $(VENV)/.tools
+	@while read -r peer; do case "$$peer" in ""|\#*) continue;; esac; \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps "$$peer" 2>/dev/null \
+	    || echo "without $$peer: its tests are skipped"; done < requirements-peers.txt
+	@touch $@
+
 setup: $(VENV)/.tools ## the virtual environment in .venv
 
 build: $(VENV)/.built-$(PROFILE) ## the core, installed into .venv
@@ -30,7 +36,7 @@ build: $(VENV)/.built-$(PROFILE) ## the core, installed into .venv
 demo: build ## a simulated cell, measured: summary and report
 	@$(BIN)/weldscan demo
 
-test: build ## every test, Rust and Python
+test: build $(VENV)/.peers ## every test, Rust and Python
 	cargo test --locked --workspace
 	$(BIN)/python -m pytest
 

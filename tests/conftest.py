@@ -13,3 +13,18 @@ def shared(path: str) -> Path:
     if not found.exists():
         pytest.skip(f"outside data missing: {found}")
     return found
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--soak", action="store_true", help="the long figures: 10,000 RSI cycles, 10,000 poses, 200 kills")
+
+
+@pytest.fixture
+def soak(request: pytest.FixtureRequest) -> bool:
+    """Was the long run asked for?"""
+    return bool(request.config.getoption("--soak"))
+
+
+@pytest.fixture
+def rsi_cycles(soak: bool) -> int:
+    return 10_000 if soak else 150

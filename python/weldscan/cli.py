@@ -21,6 +21,7 @@ import typer
 from weldscan._weldcore import __version__
 from weldscan.errors import NotMeasured, WeldscanError
 from weldscan.result import Verdict
+from weldscan.station.cli import register
 
 if TYPE_CHECKING:
     from weldscan.result import Inspection
@@ -63,6 +64,8 @@ calibrate = typer.Typer(
     help="Calibrations that are kept and used again.", no_args_is_help=True, rich_markup_mode=None, add_completion=False
 )
 app.add_typer(calibrate, name="calibrate")
+
+register(app)
 
 SessionFolder = Annotated[
     Path, typer.Argument(metavar="SESSION", help="A folder with session.json and shots/ (weldscan-session/1).")

@@ -1,0 +1,269 @@
+"""What the simulated controllers share: an arm that moves at a speed, a server, and the faults it commits on
+request.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from enum import StrEnum
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from weldscan.devices.robot import distance
+from weldscan.devices.wire import Cut, Messages, TcpTransport, Transport
+from weldscan.errors import DeviceError, DeviceTimeout
+from weldscan.pose import Floats, KukaPose
+
+HOME = KukaPose(600.0, 0.0, 700.0, 0.0, 90.0, 0.0)
+HOME_JOINTS = (0.0, -90.0, 90.0, 0.0, 0.0, 0.0)
+NULL_FRAME = KukaPose(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+T1_SPEED_MM_S = 250.0
+TURN_SPEED_DEG_S = 90.0
+HUGE_BYTES = 10_000_000
+LOOK_S = 0.05
+"""How often a serving thread looks whether it shall stop."""
+
+
+class Fault(StrEnum):
+    """What a simulated controller does wrong with one reply. Not every link can commit every fault."""
+
+    SILENCE = "silence"
+    BYTES = "bytes"
+    """The reply comes in single bytes, each in its own packet."""
+    TWICE = "twice"
+    """The reply comes twice, in one packet."""
+    WRONG_ID = "wrong-id"
+    WRONG_LENGTH = "wrong-length"
+    EMPTY = "empty"
+    GARBAGE = "garbage"
+    HUGE = "huge"
+    """10 MB where a few hundred bytes should be."""
+    DTD = "dtd"
+    ENTITY = "entity"
+    RESET = "reset"
+    """The connection is reset in the middle of the reply."""
+    RESTART = "restart"
+    """The controller goes away and comes back a second later."""
+    NAN = "nan"
+    JUMP = "jump"
+    """One pose is 400 mm off."""
+    STALE = "stale"
+    """The pose stands at what it was, or the stream repeats itself, although the arm moves."""
+
+
+class Arm:
+    """The flange of a simulated robot: moves straight at a constant speed, tells $POS_ACT in its tool and base."""
+
+    def __init__(
+        self, flange: KukaPose = HOME, tool: KukaPose = NULL_FRAME, base: KukaPose = NULL_FRAME, mode: str = "#T1"
+    ) -> None:
+        self.tool, self.base, self.mode, self.interpolation = tool, base, mode, "#BASE"
+        self.joints_deg = HOME_JOINTS
+        self.speed_mm_s = T1_SPEED_MM_S
+        self._start = self._target = flange
+        self._start_s, self._seconds = time.monotonic(), 0.0
+        self._frozen: KukaPose | None = None
+
+    def flange(self) -> KukaPose:
+        """Return where the flange is now."""
+        done = 1.0 if self._seconds == 0 else min((time.monotonic() - self._start_s) / self._seconds, 1.0)
+        if done == 1.0:
+            return self._target
+        a, b = self._start.matrix(), self._target.matrix()
+        between = np.eye(4)
+        between[:3, 3] = (1 - done) * a[:3, 3] + done * b[:3, 3]
+        between[:3, :3] = a[:3, :3] @ _partial_turn(a[:3, :3].T @ b[:3, :3], done)
+        return KukaPose.from_matrix(between)
+
+    @property
+    def moving(self) -> bool:
+        """Is the arm on its way?"""
+        return time.monotonic() < self._start_s + self._seconds
+
+    def move(self, target: KukaPose) -> None:
+        """Set off for a flange pose."""
+        self._start = self.flange()
+        far_mm, far_deg = distance(self._start, target)
+        self._start_s = time.monotonic()
+        self._seconds = max(far_mm / self.speed_mm_s, far_deg / TURN_SPEED_DEG_S)
+        self._target = target
+
+    def place(self, target: KukaPose) -> None:
+        """Be at a pose at once, as when an operator has jogged the arm there."""
+        self._start = self._target = target
+        self._seconds = 0.0
+
+    def position(self, fault: Fault | None = None) -> KukaPose:
+        """Return $POS_ACT: the tool in base."""
+        flange = self.flange()
+        self._frozen = (self._frozen or flange) if fault is Fault.STALE else None
+        flange = self._frozen or flange
+        if fault is Fault.JUMP:
+            flange = KukaPose(flange.x_mm + 400.0, *flange.values()[1:])
+        return KukaPose.from_matrix(np.linalg.inv(self.base.matrix()) @ flange.matrix() @ self.tool.matrix())
+
+
+class Controller:
+    """A simulated controller: an arm, and faults that its next replies have."""
+
+    def __init__(self, arm: Arm | None = None) -> None:
+        self.arm = arm or Arm()
+        self._faults: deque[Fault] = deque()
+        self._stop = threading.Event()
+
+    def inject(self, fault: Fault, replies: int = 1) -> None:
+        """Let the next replies have a fault, after those that wait already."""
+        self._faults.extend([fault] * replies)
+
+    def _next_fault(self) -> Fault | None:
+        return self._faults.popleft() if self._faults else None
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._stop.set()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class StreamController(Controller):
+    """Answers requests over a byte stream. A link says how a request is cut, what is answered and how it can be
+    spoilt.
+    """
+
+    restart_s = 1.0
+    """How long a restart takes."""
+
+    def cut(self, buffer: bytearray) -> bytes | None:
+        """Cut one request off the front."""
+        raise NotImplementedError
+
+    def answer(self, request: bytes, fault: Fault | None) -> bytes:
+        """Give the reply, with the fault in its content where the fault is one of content."""
+        raise NotImplementedError
+
+    def serve(self, transport: Transport) -> None:
+        """Answer until the other side goes away."""
+        cut: Cut = self.cut
+        messages = Messages(transport, cut)
+        with contextlib.suppress(DeviceError, OSError, ValueError):
+            while not self._stop.is_set():
+                try:
+                    request = messages.next(time.monotonic() + LOOK_S)
+                except DeviceTimeout:
+                    continue
+                fault = self._next_fault()
+                reply = self.answer(request, fault)
+                deadline_s = time.monotonic() + 2.0
+                for piece in self._spoilt(reply, fault):
+                    transport.send(piece, deadline_s)
+                if fault is Fault.RESET or fault is Fault.RESTART:
+                    self._break(transport, fault)
+                    break
+
+    def _spoilt(self, reply: bytes, fault: Fault | None) -> Iterator[bytes]:
+        match fault:
+            case Fault.SILENCE | Fault.RESTART:
+                return
+            case Fault.BYTES:
+                for byte in reply:
+                    yield bytes([byte])
+                    time.sleep(0.0002)
+            case Fault.TWICE:
+                yield reply + reply
+            case Fault.GARBAGE:
+                yield os.urandom(64).replace(b"<", b"#").replace(b"\n", b"#") + b"\r\n"
+            case Fault.HUGE:
+                yield reply[:7] + b"A" * HUGE_BYTES
+            case Fault.RESET:
+                yield reply[: len(reply) // 2]
+            case _:
+                yield reply
+
+    def _break(self, transport: Transport, fault: Fault) -> None:
+        transport.close()
+
+
+class TcpController(StreamController):
+    """A `StreamController` that listens on TCP; port 0 takes a free one."""
+
+    def __init__(self, arm: Arm | None = None, host: str = "127.0.0.1", port: int = 0) -> None:
+        super().__init__(arm)
+        self.host = host
+        self._listener = self._listen(port)
+        self.port: int = self._listener.getsockname()[1]
+        self._open: set[socket.socket] = set()
+        self._away = threading.Event()
+        self._thread = threading.Thread(target=self._accept, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop serving and hang up on everyone."""
+        super().close()
+        self._thread.join(5.0)
+        self._hang_up()
+
+    def _listen(self, port: int) -> socket.socket:
+        listener = socket.create_server((self.host, port))
+        listener.settimeout(LOOK_S)
+        return listener
+
+    def _accept(self) -> None:
+        while not self._stop.is_set():
+            if self._away.is_set():
+                self._listener.close()
+                self._hang_up()
+                self._stop.wait(self.restart_s)
+                self._away.clear()
+                self._listener = self._listen(self.port)
+            try:
+                peer, address = self._listener.accept()
+            except TimeoutError:
+                continue
+            self._open.add(peer)
+            threading.Thread(target=self._serve, args=(peer, f"{address[0]}:{address[1]}"), daemon=True).start()
+        self._listener.close()
+
+    def _serve(self, peer: socket.socket, name: str) -> None:
+        try:
+            self.serve(TcpTransport(peer, name))
+        finally:
+            self._open.discard(peer)
+            peer.close()
+
+    def _break(self, transport: Transport, fault: Fault) -> None:
+        if fault is Fault.RESTART:
+            self._away.set()
+        super()._break(transport, fault)
+
+    def _hang_up(self) -> None:
+        for peer in list(self._open):
+            with contextlib.suppress(OSError):
+                peer.shutdown(socket.SHUT_RDWR)
+
+
+def _partial_turn(turn: Floats, fraction: float) -> Floats:
+    """Rodrigues: a fraction of a rotation, about its own axis."""
+    axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    angle = math.atan2(float(np.linalg.norm(axis)), float(np.trace(turn)) - 1.0)
+    if np.linalg.norm(axis) < 1e-12:
+        return np.eye(3)
+    x, y, z = axis / np.linalg.norm(axis)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    part = angle * fraction
+    result: Floats = np.eye(3) + math.sin(part) * cross + (1.0 - math.cos(part)) * (cross @ cross)
+    return result

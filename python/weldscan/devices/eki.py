@@ -1,0 +1,360 @@
+"""EthernetKRL: XML over TCP; the robot is the server, on ports 54600 to 54615, and a KRL program of ours answers.
+
+There is no length and no terminator: a message ends with the closing tag of its root. On the controller every element
+has its own FIFO, so both sides always send every element. Configuration and program: `krl/WeldscanEki.xml`,
+`krl/weldscan_eki.src`.
+"""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+from xml.etree import ElementTree
+
+from pydantic import Field
+
+from weldscan.devices.controller import LOOK_S, Arm, Controller, Fault, TcpController
+from weldscan.devices.robot import Reading, Robot, RobotSettings
+from weldscan.devices.wire import LARGEST_MESSAGE, Link, TcpTransport, Transport, cut_xml, parse_xml
+from weldscan.errors import DeviceError, InputError
+from weldscan.pose import KukaPose
+
+POSE, MOVE = 1, 2
+"""Commands of our program."""
+STATUS = {0: "done", 1: "unknown command", 2: "not in T1", 3: "target out of reach"}
+MODES = {1: "#T1", 2: "#T2", 3: "#AUT", 4: "#EX"}
+INTERPOLATIONS = {1: "#BASE", 2: "#TCP"}
+CARTESIAN = ("X", "Y", "Z", "A", "B", "C")
+JOINTS = ("A1", "A2", "A3", "A4", "A5", "A6")
+STREAM_S = 0.012
+"""A state stream sends once per interpolation cycle."""
+
+
+class EkiSettings(RobotSettings):
+    """`[robot]` with `link = "eki"`."""
+
+    link: Literal["eki"] = "eki"
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=1, le=65535)] = 54600
+
+
+# --- the configuration ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Element:
+    """One line of an EthernetKRL configuration: `Robot/Position/@X` and its type."""
+
+    path: tuple[str, ...]
+    attribute: str | None
+    type: str
+
+    @classmethod
+    def parse(cls, tag: str, kind: str = "REAL") -> Element:
+        """Read a tag as the configuration writes it."""
+        *path, last = tag.split("/")
+        return cls(tuple(path), last[1:], kind) if last.startswith("@") else cls((*path, last), None, kind)
+
+
+@dataclass(frozen=True)
+class EkiConfig:
+    """What a controller with a given EthernetKRL configuration sends and expects."""
+
+    port: int
+    protocol: str
+    receive: tuple[Element, ...]
+    send: tuple[Element, ...]
+
+    @classmethod
+    def read(cls, path: Path) -> EkiConfig:
+        """Read a configuration file, which may have comments but no DTD."""
+        text = path.read_bytes()
+        if b"<!DOCTYPE" in text or b"<!ENTITY" in text or len(text) > LARGEST_MESSAGE:
+            raise InputError(f"{path}: XML with a DTD, or of more than {LARGEST_MESSAGE} bytes, is refused")
+        try:
+            root = ElementTree.fromstring(text)
+            elements = {
+                side: tuple(
+                    Element.parse(item.attrib["Tag"], item.get("Type", "REAL"))
+                    for item in root.findall(f"{side}/XML/ELEMENT")
+                    if "Set_Flag" not in item.attrib  # a flag on a whole branch carries no value
+                )
+                for side in ("RECEIVE", "SEND")
+            }
+            return cls(
+                port=int(root.findtext("CONFIGURATION/INTERNAL/PORT", "54600")),
+                protocol=root.findtext("CONFIGURATION/INTERNAL/PROTOCOL", "TCP").strip().upper(),
+                receive=elements["RECEIVE"],
+                send=elements["SEND"],
+            )
+        except (ElementTree.ParseError, KeyError, ValueError) as error:
+            raise InputError(f"{path}: not an EthernetKRL configuration: {error}") from error
+
+    @property
+    def asks(self) -> bool:
+        """Is it one reply per request (ours), or a stream of states?"""
+        return any(element.attribute == "Id" for element in self.receive)
+
+
+OURS = EkiConfig(
+    port=54600,
+    protocol="TCP",
+    receive=(
+        Element.parse("Sensor/Request/@Id", "INT"),
+        Element.parse("Sensor/Request/@Command", "INT"),
+        *(Element.parse(f"Sensor/Target/@{name}") for name in CARTESIAN),
+    ),
+    send=(
+        Element.parse("Robot/Reply/@Id"),
+        Element.parse("Robot/Reply/@Status"),
+        Element.parse("Robot/Reply/@Mode"),
+        Element.parse("Robot/Reply/@Interpolation"),
+        *(Element.parse(f"Robot/{frame}/@{name}") for frame in ("Position", "Tool", "Base") for name in CARTESIAN),
+        *(Element.parse(f"Robot/Axis/@{name}") for name in JOINTS),
+    ),
+)
+
+
+def compose(elements: tuple[Element, ...], values: dict[Element, str]) -> bytes:
+    """Return one message with all elements of a configuration, in its order."""
+    root = ElementTree.Element(elements[0].path[0])
+    for element in elements:
+        node = root
+        for name in element.path[1:]:
+            child = node.find(name)
+            node = ElementTree.SubElement(node, name) if child is None else child
+        if element.attribute is None:
+            node.text = values[element]
+        else:
+            node.set(element.attribute, values[element])
+    return ElementTree.tostring(root)
+
+
+def dissect(elements: tuple[Element, ...], message: bytes) -> dict[Element, str]:
+    """Return the value of every element of a configuration; numbers are checked for being numbers."""
+    root = parse_xml(message, elements[0].path[0])
+    values = {}
+    for element in elements:
+        node = root if len(element.path) == 1 else root.find("/".join(element.path[1:]))
+        text = None if node is None else node.text if element.attribute is None else node.get(element.attribute)
+        where = "/".join((*element.path, *([f"@{element.attribute}"] if element.attribute else [])))
+        if text is None or not text.strip():
+            raise DeviceError(f"{where} is {'missing' if text is None else 'empty'}")
+        if element.type in ("REAL", "INT"):
+            try:
+                number = float(text) if element.type == "REAL" else int(text)
+            except ValueError as error:
+                raise DeviceError(f"{where}: {text[:40]!r} is not a number") from error
+            if not math.isfinite(number):
+                raise DeviceError(f"{where} is {number}")
+        values[element] = text.strip()
+    return values
+
+
+# --- the client -------------------------------------------------------------------------------------------------------
+
+
+class EkiRobot(Robot):
+    """A robot behind EthernetKRL with our configuration and program."""
+
+    Settings = EkiSettings
+    settings: EkiSettings
+
+    def __init__(self, settings: EkiSettings) -> None:
+        self.settings = settings
+        self.name = f"EKI {settings.host}:{settings.port}"
+        self._number = 0
+        self._link = Link(
+            self.name,
+            lambda deadline_s: TcpTransport.connect(settings.host, settings.port, deadline_s),
+            cut_xml,
+            settings.timeout_s,
+            settings.reconnect_s,
+        )
+        self._link.open()
+
+    def read(self) -> Reading:
+        """Ask the program for its reading."""
+        asked_s = time.monotonic()
+        status, reading = self._ask(POSE, None, asked_s)
+        if status != 0:
+            raise DeviceError(f"{self.name}: {STATUS.get(status, f'status {status}')}")
+        return reading
+
+    def close(self) -> None:
+        """Hang up."""
+        self._link.close()
+
+    def _move(self, target: KukaPose, give_up_s: float) -> None:
+        now_s = time.monotonic()
+        status, _ = self._ask(MOVE, target, now_s, repeat=False, timeout_s=give_up_s - now_s)
+        if status != 0:
+            raise DeviceError(f"{self.name}: not moved: {STATUS.get(status, f'status {status}')}")
+
+    def _ask(
+        self,
+        command: int,
+        target: KukaPose | None,
+        asked_s: float,
+        repeat: bool = True,
+        timeout_s: float | None = None,
+    ) -> tuple[int, Reading]:
+        number = self._number = self._number % 1_000_000 + 1
+        numbers = [number, command, *(target.values() if target else [0.0] * 6)]
+        request = compose(OURS.receive, dict(zip(OURS.receive, map(str, numbers), strict=True)))
+
+        def read(message: bytes) -> tuple[int, Reading]:
+            texts = dissect(OURS.send, message)
+            values = [float(texts[element]) for element in OURS.send]
+            replied, status, mode, interpolation = (int(value) for value in values[:4])
+            if replied != number:
+                raise DeviceError(f"reply {replied} to request {number}")
+            return status, Reading(
+                position=KukaPose(*values[4:10]),
+                tool=KukaPose(*values[10:16]),
+                base=KukaPose(*values[16:22]),
+                interpolation=INTERPOLATIONS.get(interpolation, str(interpolation)),
+                mode=MODES.get(mode, str(mode)),
+                time_s=(asked_s + time.monotonic()) / 2,
+                joints_deg=tuple(values[22:28]),
+            )
+
+        return self._link.ask(request, read, repeat, timeout_s)
+
+
+# --- the simulated controller -----------------------------------------------------------------------------------------
+
+
+class EkiController(TcpController):
+    """A simulated controller with EthernetKRL over TCP: our program, or a state stream as other configurations have
+    it.
+    """
+
+    def __init__(
+        self, arm: Arm | None = None, host: str = "127.0.0.1", port: int = 0, config: EkiConfig = OURS
+    ) -> None:
+        self.config = config
+        super().__init__(arm, host, port)
+
+    def cut(self, buffer: bytearray) -> bytes | None:
+        """Cut one message."""
+        return cut_xml(buffer)
+
+    def serve(self, transport: Transport) -> None:
+        """Answer requests; or stream states and obey commands, as far as the configuration has them."""
+        if not self.config.asks and self.config.send:
+            threading.Thread(target=self._stream, args=(transport,), daemon=True).start()
+        super().serve(transport)
+
+    def answer(self, request: bytes, fault: Fault | None) -> bytes:
+        """Do what the command says."""
+        values = dissect(self.config.receive, request)
+        if not self.config.asks:
+            obey(self.arm, values)
+            return b""
+        number, command, *target = (float(values[element]) for element in self.config.receive)
+        status = 0
+        if command == MOVE:
+            if self.arm.mode == "#T1":
+                self.arm.move(KukaPose(*target))
+                while self.arm.moving and not self._stop.is_set():
+                    time.sleep(0.005)
+            else:
+                status = 2
+        elif command != POSE:
+            status = 1
+        if fault is Fault.EMPTY:
+            return b"<Robot></Robot>"
+        shown = int(number) + (1 if fault is Fault.WRONG_ID else 0)
+        reply = compose(self.config.send, state(self.config.send, self.arm, fault, shown, status))
+        match fault:
+            case Fault.DTD:
+                return b'<!DOCTYPE Robot SYSTEM "http://127.0.0.1/robot.dtd">' + reply
+            case Fault.ENTITY:
+                return b'<!DOCTYPE Robot [<!ENTITY x "' + b"9" * 1000 + b'">]>' + reply.replace(b'X="', b'X="&x;', 1)
+            case Fault.WRONG_LENGTH:
+                return reply.replace(b"</Robot>", b"</Robat>")
+            case Fault.NAN:
+                return reply.replace(b'X="', b'X="NaN" Q="', 1)
+            case _:
+                return reply
+
+    def _stream(self, transport: Transport) -> None:
+        while not self._stop.wait(STREAM_S):
+            try:
+                transport.send(compose(self.config.send, state(self.config.send, self.arm)), time.monotonic() + 1.0)
+            except (DeviceError, OSError):
+                return
+
+
+class EkiUdpController(Controller):
+    """A simulated controller with EthernetKRL over UDP: streams its state to whoever spoke last."""
+
+    def __init__(self, config: EkiConfig, arm: Arm | None = None, host: str = "127.0.0.1", port: int = 0) -> None:
+        super().__init__(arm)
+        self.config = config
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((host, port))
+        self._socket.settimeout(STREAM_S)
+        self.port: int = self._socket.getsockname()[1]
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop."""
+        super().close()
+        self._thread.join(5 * LOOK_S)
+        self._socket.close()
+
+    def _serve(self) -> None:
+        peer = None
+        while not self._stop.is_set():
+            try:
+                message, peer = self._socket.recvfrom(LARGEST_MESSAGE)
+                obey(self.arm, dissect(self.config.receive, message))
+            except (TimeoutError, DeviceError):
+                pass
+            if peer is not None:
+                self._socket.sendto(compose(self.config.send, state(self.config.send, self.arm)), peer)
+
+
+def state(
+    elements: tuple[Element, ...], arm: Arm, fault: Fault | None = None, number: int = 0, status: int = 0
+) -> dict[Element, str]:
+    """Return what an arm has to say to every element, found by the names that configurations use; 0 for the others."""
+    frames = {"Tool": arm.tool, "Base": arm.base}
+    position = arm.position(fault)
+    special = {
+        "Id": number,
+        "Status": status,
+        "Mode": next((code for code, name in MODES.items() if name == arm.mode), 0),
+        "Interpolation": next((code for code, name in INTERPOLATIONS.items() if name == arm.interpolation), 0),
+    }
+    values = {}
+    for element in elements:
+        name, group = element.attribute or element.path[-1], element.path[-1]
+        if name in JOINTS:
+            value = 0.0 if group in ("Vel", "Eff") else arm.joints_deg[JOINTS.index(name)]
+        elif name in CARTESIAN:
+            value = frames.get(group, position).values()[CARTESIAN.index(name)]
+        else:
+            value = special.get(name, 0)
+        values[element] = str(value)
+    return values
+
+
+def obey(arm: Arm, values: dict[Element, str]) -> None:
+    """Do what a command of another configuration says: Cartesian motion (types 2 and 3), or joints that are noted."""
+    numbers = {(element.path[-1], element.attribute): float(text) for element, text in values.items()}
+    kind = numbers.get(("Type", None))
+    if kind in (2.0, 3.0):
+        arm.move(KukaPose(*(numbers[("Cart", name)] for name in CARTESIAN)))
+    else:
+        group = "Axis" if kind == 1.0 else "Pos"
+        if (group, "A1") in numbers:
+            arm.joints_deg = tuple(numbers[(group, name)] for name in JOINTS)  # type: ignore[assignment]

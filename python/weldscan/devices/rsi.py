@@ -1,0 +1,266 @@
+"""RSI: the controller sends its pose as XML over UDP every 4 or 12 ms, and stops the robot when it gets no answer in
+time.
+
+Used here to read poses only: every answer carries zero corrections and echoes IPOC, digit by digit. The stream is
+answered by a thread of its own before it is looked at. With ONLYSEND = TRUE in the configuration the controller wants
+no answer, which is the better choice for a measuring cell: `krl/WeldscanRsi.xml`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import socket
+import threading
+import time
+from typing import Annotated, Literal
+from xml.etree import ElementTree
+
+from pydantic import Field
+
+from weldscan.devices.controller import HUGE_BYTES, Arm, Controller, Fault
+from weldscan.devices.robot import Reading, Robot, RobotSettings
+from weldscan.devices.wire import parse_xml
+from weldscan.errors import DeviceError, DeviceTimeout, InputError
+from weldscan.pose import KukaPose
+
+LARGEST_PACKET = 65_535
+CARTESIAN = ("X", "Y", "Z", "A", "B", "C")
+JOINTS = ("A1", "A2", "A3", "A4", "A5", "A6")
+REAL_TIME_PRIORITY = 10
+"""Of the answering thread alone, above every ordinary thread; it waits for packets nearly all the time."""
+_IPOC = re.compile(rb"<IPOC>\s*(\d{1,20})\s*</IPOC>")
+
+
+class RsiSettings(RobotSettings):
+    """`[robot]` with `link = "rsi"`. `port` and `sen_type` as in the controller's RSI configuration."""
+
+    link: Literal["rsi"] = "rsi"
+    host: str = "127.0.0.1"
+    """The address of this computer that the controller sends to."""
+    port: Annotated[int, Field(ge=0, le=65535)] = 64000
+    controller: str = "127.0.0.1"
+    """Packets from any other address are ignored."""
+    sen_type: Annotated[str, Field(pattern=r"^\w{1,32}$")] = "ImFree"
+    only_send: bool = False
+    """ONLYSEND = TRUE in the controller's configuration: nothing is answered."""
+    tool: tuple[float, float, float, float, float, float] = (0.0,) * 6
+    """$TOOL while RSI runs, X Y Z A B C: the stream does not tell it. Our KRL program sets $NULLFRAME."""
+    base: tuple[float, float, float, float, float, float] = (0.0,) * 6
+    """$BASE while RSI runs."""
+
+
+def answer(packet: bytes, sen_type: str) -> bytes | None:
+    """Return the answer to a packet: no correction, and its IPOC as it came. None when it has no IPOC.
+
+    >>> answer(b'<Rob Type="KUKA"><IPOC>0042</IPOC></Rob>', "ImFree")[-23:]
+    b'<IPOC>0042</IPOC></Sen>'
+    """
+    ipoc = _IPOC.search(packet)
+    if ipoc is None:
+        return None
+    return b'<Sen Type="%s"><RKorr X="0.0" Y="0.0" Z="0.0" A="0.0" B="0.0" C="0.0"/><IPOC>%s</IPOC></Sen>' % (
+        sen_type.encode(),
+        ipoc[1],
+    )
+
+
+class RsiRobot(Robot):
+    """The pose stream of a robot that runs RSI. The link cannot move the robot."""
+
+    Settings = RsiSettings
+    settings: RsiSettings
+
+    def __init__(self, settings: RsiSettings) -> None:
+        self.settings = settings
+        self.name = f"RSI {settings.host}:{settings.port}"
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind((settings.host, settings.port))
+        except OSError as error:
+            self._socket.close()
+            raise DeviceError(f"{self.name}: cannot listen: {error.strerror}") from error
+        self.port: int = self._socket.getsockname()[1]
+        self._news = threading.Condition()
+        self._packet, self._time_s, self._ipoc = b"", float("-inf"), -1
+        self.packets = self.answered = self.unusable = self.repeated = 0
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+
+    def read(self) -> Reading:
+        """Wait for the next packet of the stream: what came before the question is not an answer to it."""
+        asked_s = time.monotonic()
+        with self._news:
+            if not self._news.wait_for(lambda: self._time_s > asked_s, self.settings.timeout_s):
+                raise DeviceTimeout(
+                    f"{self.name}: no new pose within {self.settings.timeout_s:g} s "
+                    f"({self.packets} packets so far, {self.unusable} unusable, {self.repeated} repeated)"
+                )
+            packet, time_s = self._packet, self._time_s
+        try:
+            return self._reading(packet, time_s)
+        except (DeviceError, InputError) as error:
+            raise DeviceError(f"{self.name}: {error}") from error
+
+    def close(self) -> None:
+        """Stop listening. The controller then stops the robot's RSI program, unless it only sends."""
+        self._closed.set()
+        self._thread.join(2.0)
+        self._socket.close()
+
+    def _listen(self) -> None:
+        """Answer first, look later."""
+        with contextlib.suppress(AttributeError, OSError):  # real-time priority where the system has it and allows it
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REAL_TIME_PRIORITY))
+        self._socket.settimeout(0.2)
+        while not self._closed.is_set():
+            try:
+                packet, peer = self._socket.recvfrom(LARGEST_PACKET)
+            except TimeoutError:
+                continue
+            except OSError:
+                continue  # an ICMP message about an earlier answer: the controller went away, and may come back
+            now_s = time.monotonic()
+            if peer[0] != self.settings.controller:
+                continue
+            reply = answer(packet, self.settings.sen_type)
+            if reply is not None and not self.settings.only_send:
+                with contextlib.suppress(OSError):
+                    self._socket.sendto(reply, peer)
+                    self.answered += 1
+            self.packets += 1
+            ipoc = _IPOC.search(packet)
+            if ipoc is None or len(packet) > 8192:
+                self.unusable += 1
+                continue
+            number = int(ipoc[1])
+            if number == self._ipoc:
+                self.repeated += 1  # a stream that stands still tells nothing new
+                continue
+            with self._news:
+                self._ipoc, self._packet, self._time_s = number, packet, now_s
+                self._news.notify_all()
+
+    def _reading(self, packet: bytes, time_s: float) -> Reading:
+        root = parse_xml(packet, "Rob")
+        kind = root.get("Type", root.get("TYPE"))
+        if kind != "KUKA":
+            raise DeviceError(f"a packet of type {kind}, expected KUKA")
+        joints = root.find("AIPos")
+        return Reading(
+            position=KukaPose(*_numbers(root.find("RIst"), "RIst", CARTESIAN)),
+            tool=KukaPose(*self.settings.tool),
+            base=KukaPose(*self.settings.base),
+            interpolation="#BASE",
+            mode="",
+            time_s=time_s,
+            joints_deg=() if joints is None else tuple(_numbers(joints, "AIPos", JOINTS)),
+        )
+
+
+def _numbers(element: ElementTree.Element | None, name: str, keys: tuple[str, ...]) -> list[float]:
+    if element is None:
+        raise DeviceError(f"the packet has no {name}: add DEF_{name} to the RSI configuration")
+    try:
+        return [float(element.get(key, "missing")) for key in keys]
+    except ValueError as error:
+        raise DeviceError(f"{name}: {error}") from error
+
+
+class RsiController(Controller):
+    """A simulated controller that runs RSI: sends a packet every cycle, counts wrong and late answers."""
+
+    def __init__(
+        self,
+        arm: Arm | None = None,
+        host: str = "127.0.0.1",
+        port: int = 64000,
+        cycle_s: float = 0.012,
+        sen_type: str = "ImFree",
+        only_send: bool = False,
+    ) -> None:
+        super().__init__(arm)
+        self.cycle_s, self.sen_type, self.only_send = cycle_s, sen_type, only_send
+        self.wrong = self.late = self.cycles = 0
+        self.ipoc = 1_343_092
+        self._peer = (host, port)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((host, 0))
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop."""
+        super().close()
+        self._thread.join(5.0)
+        self._socket.close()
+
+    def packet(self, fault: Fault | None = None) -> bytes:
+        """Return what one cycle sends."""
+        pose = dict(zip(CARTESIAN, self.arm.position(fault).values(), strict=True))
+        joints = dict(zip(JOINTS, self.arm.joints_deg, strict=True))
+        text = (
+            f'<Rob Type="KUKA"><RIst {_attributes(pose)}/><RSol {_attributes(pose)}/><AIPos {_attributes(joints)}/>'
+            f'<Delay D="{self.late}"/><IPOC>{self.ipoc}</IPOC></Rob>'
+        ).encode()
+        match fault:
+            case Fault.GARBAGE:
+                return b"\xff\x00 not XML at all"
+            case Fault.EMPTY:
+                return b'<Rob Type="KUKA"><IPOC>%d</IPOC></Rob>' % self.ipoc
+            case Fault.NAN:
+                return text.replace(b'X="', b'X="nan" Q="', 1)
+            case Fault.HUGE:
+                return text.replace(b"<Delay", b"<EStr>" + b"A" * min(HUGE_BYTES, 60_000) + b"</EStr><Delay")
+            case Fault.DTD:
+                return b'<!DOCTYPE Rob SYSTEM "http://127.0.0.1/rob.dtd">' + text
+            case Fault.ENTITY:
+                return b'<!DOCTYPE Rob [<!ENTITY x "1">]>' + text.replace(b'X="', b'X="&x;', 1)
+            case _:
+                return text
+
+    def _run(self) -> None:
+        next_s = time.monotonic()
+        while not self._stop.is_set():
+            fault = self._next_fault()
+            if fault is Fault.RESTART:
+                self.ipoc = 1000
+                if self._stop.wait(1.0):
+                    break
+                next_s = time.monotonic()
+            if fault is not Fault.SILENCE:
+                with contextlib.suppress(OSError):
+                    self._socket.sendto(self.packet(fault), self._peer)
+            self._judge(next_s + self.cycle_s)
+            self.cycles += 1
+            if fault is not Fault.STALE:
+                self.ipoc += round(self.cycle_s * 1000)
+            next_s += self.cycle_s
+            if self._stop.wait(max(next_s - time.monotonic(), 0.0)):
+                break
+
+    def _judge(self, deadline_s: float) -> None:
+        """Wait for the answer of this cycle."""
+        if self.only_send:
+            return
+        want = b'<Sen Type="%s">' % self.sen_type.encode()
+        while True:
+            self._socket.settimeout(max(deadline_s - time.monotonic(), 0.0005))
+            try:
+                reply = self._socket.recv(LARGEST_PACKET)
+            except TimeoutError:
+                self.late += 1
+                return
+            except OSError:
+                continue
+            ipoc = _IPOC.search(reply)
+            if ipoc is not None and int(ipoc[1]) == self.ipoc and reply.startswith(want):
+                return
+            if ipoc is None or int(ipoc[1]) > self.ipoc or not reply.startswith(want):
+                self.wrong += 1
+
+
+def _attributes(values: dict[str, float]) -> str:
+    return " ".join(f'{name}="{value:.6f}"' for name, value in values.items())

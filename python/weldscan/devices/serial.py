@@ -1,0 +1,259 @@
+r"""A serial line through pyserial: a device, `socket://host:port` or `loop://`; a KRL program of ours with CREAD and
+CWRITE.
+
+One request, one reply, each a line `<id> <words>*<checksum>\r\n` in ASCII. The checksum is Fletcher's with 16 bits, in
+decimal digits, over everything before the star: KRL can add and divide integers, and so can compute it; unlike an XOR
+it sees two bytes that changed places. Program: `krl/weldscan_serial.src`.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from typing import Annotated, Literal
+
+import serial
+from pydantic import Field
+
+from weldscan.devices.controller import LOOK_S, Arm, Fault, StreamController
+from weldscan.devices.eki import INTERPOLATIONS, MODES, STATUS
+from weldscan.devices.robot import Reading, Robot, RobotSettings
+from weldscan.devices.wire import ConnectionLost, FileTransport, Link
+from weldscan.errors import DeviceError, DeviceTimeout
+from weldscan.pose import KukaPose
+
+LONGEST_LINE = 1024
+REPLY_NUMBERS = 3 + 4 * 6
+"""Status, mode, interpolation; position, tool, base, joints."""
+
+
+class SerialSettings(RobotSettings):
+    """`[robot]` with `link = "serial"`."""
+
+    link: Literal["serial"] = "serial"
+    port: str
+    """Such as /dev/ttyUSB0, COM3 or socket://127.0.0.1:4001."""
+    baud: Annotated[int, Field(ge=300, le=4_000_000)] = 115_200
+
+
+# --- the wire ---------------------------------------------------------------------------------------------------------
+
+
+def checksum(data: bytes) -> int:
+    """Return Fletcher's checksum: two running sums modulo 255, the first in the low byte.
+
+    Source: J. G. Fletcher, An arithmetic checksum for serial transmissions, IEEE Trans. Comm. 30 (1982) 247.
+
+    >>> checksum(b"abcde") == 0xC8F0
+    True
+    """
+    low = high = 0
+    for byte in data:
+        low = (low + byte) % 255
+        high = (high + low) % 255
+    return high * 256 + low
+
+
+def encode_line(number: int, words: str) -> bytes:
+    """Return one line."""
+    text = f"{number} {words}".encode("ascii")
+    return text + b"*%d\r\n" % checksum(text)
+
+
+def decode_line(line: bytes) -> tuple[int, list[str]]:
+    """Return the id and the words of a line whose checksum is right."""
+    text, star, digits = line.rstrip(b"\r\n").rpartition(b"*")
+    if not star or not digits.isdigit() or int(digits) != checksum(text):
+        raise DeviceError(f"a line with a wrong checksum: {line[:40]!r}")
+    number, *words = text.decode("ascii", "replace").split()
+    if not number.isdigit():
+        raise DeviceError(f"a line without a number: {line[:40]!r}")
+    return int(number), words
+
+
+def cut_line(buffer: bytearray) -> bytes | None:
+    """Cut one line."""
+    end = buffer.find(b"\n")
+    if end < 0 or end > LONGEST_LINE:
+        if len(buffer) > LONGEST_LINE:
+            raise DeviceError(f"a line of more than {LONGEST_LINE} bytes")
+        return None
+    line = bytes(buffer[: end + 1])
+    del buffer[: end + 1]
+    return line
+
+
+class SerialTransport:
+    """A byte stream over pyserial."""
+
+    def __init__(self, port: str, baud: int) -> None:
+        try:
+            self._port = serial.serial_for_url(port, baudrate=baud, timeout=0.0, exclusive=None)
+            self._port.reset_input_buffer()
+        except (OSError, ValueError) as error:
+            raise ConnectionLost(f"{port}: cannot open: {error}") from error
+        self._name = port
+
+    def send(self, data: bytes, deadline_s: float) -> None:
+        """Send all of it."""
+        try:
+            self._port.write_timeout = max(deadline_s - time.monotonic(), 0.001)
+            self._port.write(data)
+        except serial.SerialTimeoutException as error:
+            raise DeviceTimeout(f"{self._name}: does not take what is sent") from error
+        except OSError as error:
+            raise ConnectionLost(f"{self._name}: lost: {error}") from error
+
+    def receive(self, deadline_s: float) -> bytes:
+        """Wait for at least one byte."""
+        try:
+            self._port.timeout = max(deadline_s - time.monotonic(), 0.0)
+            data: bytes = self._port.read(1)
+            if data:
+                self._port.timeout = 0.0
+                data += self._port.read(LONGEST_LINE)
+        except (OSError, TypeError) as error:  # pyserial: TypeError when the port vanishes in mid-read
+            raise ConnectionLost(f"{self._name}: lost: {error}") from error
+        if not data:
+            raise DeviceTimeout(f"{self._name}: no whole answer in time")
+        return data
+
+    def close(self) -> None:
+        """Close it."""
+        self._port.close()
+
+
+# --- the client -------------------------------------------------------------------------------------------------------
+
+
+class SerialRobot(Robot):
+    """A robot at the end of a serial line, with our program running."""
+
+    Settings = SerialSettings
+    settings: SerialSettings
+
+    def __init__(self, settings: SerialSettings) -> None:
+        self.settings = settings
+        self.name = f"serial {settings.port}"
+        self._number = 0
+        self._link = Link(
+            self.name,
+            lambda _deadline_s: SerialTransport(settings.port, settings.baud),
+            cut_line,
+            settings.timeout_s,
+            settings.reconnect_s,
+        )
+        self._link.open()
+
+    def read(self) -> Reading:
+        """Ask the program for its reading."""
+        status, reading = self._ask("POSE")
+        if status != 0:
+            raise DeviceError(f"{self.name}: {STATUS.get(status, f'status {status}')}")
+        return reading
+
+    def close(self) -> None:
+        """Close the port."""
+        self._link.close()
+
+    def _move(self, target: KukaPose, give_up_s: float) -> None:
+        words = "MOVE " + " ".join(f"{value:.6f}" for value in target.values())
+        status, _ = self._ask(words, repeat=False, timeout_s=give_up_s - time.monotonic())
+        if status != 0:
+            raise DeviceError(f"{self.name}: not moved: {STATUS.get(status, f'status {status}')}")
+
+    def _ask(self, words: str, repeat: bool = True, timeout_s: float | None = None) -> tuple[int, Reading]:
+        number = self._number = self._number % 1_000_000 + 1
+        asked_s = time.monotonic()
+
+        def read(line: bytes) -> tuple[int, Reading]:
+            replied, texts = decode_line(line)
+            if replied != number:
+                raise DeviceError(f"reply {replied} to request {number}")
+            if len(texts) != REPLY_NUMBERS:
+                raise DeviceError(f"{len(texts)} numbers for {REPLY_NUMBERS}")
+            try:
+                values = [float(text) for text in texts]
+                status, mode, interpolation = (int(text) for text in texts[:3])
+            except ValueError as error:
+                raise DeviceError(f"not a number: {error}") from error
+            return status, Reading(
+                position=KukaPose(*values[3:9]),
+                tool=KukaPose(*values[9:15]),
+                base=KukaPose(*values[15:21]),
+                interpolation=INTERPOLATIONS.get(interpolation, str(interpolation)),
+                mode=MODES.get(mode, str(mode)),
+                time_s=(asked_s + time.monotonic()) / 2,
+                joints_deg=tuple(values[21:27]),
+            )
+
+        return self._link.ask(encode_line(number, words), read, repeat, timeout_s)
+
+
+# --- the simulated controller -----------------------------------------------------------------------------------------
+
+
+class SerialController(StreamController):
+    """A simulated controller at the other end of a pseudo-terminal; `port` is what the client opens."""
+
+    def __init__(self, arm: Arm | None = None) -> None:
+        import pty  # noqa: PLC0415 - not there on Windows, where the client runs all the same
+        import tty  # noqa: PLC0415
+
+        super().__init__(arm)
+        self._near, self._far = pty.openpty()
+        tty.setraw(self._far)  # and keep it open: the terminal lives on when a client closes its own
+        self.port = os.ttyname(self._far)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop, and let the terminal vanish."""
+        super().close()
+        self._thread.join(10 * LOOK_S)
+        os.close(self._far)
+        os.close(self._near)
+
+    def cut(self, buffer: bytearray) -> bytes | None:
+        """Cut one line."""
+        return cut_line(buffer)
+
+    def answer(self, request: bytes, fault: Fault | None) -> bytes:
+        """Do what the line says."""
+        number, (command, *words) = decode_line(request)
+        arm, status = self.arm, 0
+        if command == "MOVE" and len(words) == 6:
+            if arm.mode == "#T1":
+                arm.move(KukaPose(*(float(word) for word in words)))
+                while arm.moving and not self._stop.is_set():
+                    time.sleep(0.005)
+            else:
+                status = 2
+        elif command != "POSE":
+            status = 1
+        codes = [next((code for code, name in MODES.items() if name == arm.mode), 0)]
+        codes.append(next((code for code, name in INTERPOLATIONS.items() if name == arm.interpolation), 0))
+        frames = [arm.position(fault).values(), arm.tool.values(), arm.base.values(), arm.joints_deg]
+        words = [str(code) for code in (status, *codes)]
+        words += [f"{value:.6f}" for frame in frames for value in frame]
+        match fault:
+            case Fault.NAN:
+                words[3] = "NaN"
+            case Fault.EMPTY:
+                words = []
+            case Fault.WRONG_ID:
+                number += 1
+        line = encode_line(number, " ".join(words))
+        return line.replace(b".", b"", 1) if fault is Fault.WRONG_LENGTH else line
+
+    def _run(self) -> None:
+        while not self._stop.is_set():  # a fault ends one round of serving, not the terminal
+            self.serve(_Kept(self._near, self.port))
+
+
+class _Kept(FileTransport):
+    """The near end of the terminal, which a broken conversation does not close."""
+
+    def close(self) -> None:
+        """Keep it."""

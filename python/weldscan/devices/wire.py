@@ -1,0 +1,268 @@
+"""Whole messages out of a byte stream, one question at a time, and what happens when the other side misbehaves.
+
+The three stream links (KVP, EthernetKRL, serial) differ in how a message is cut from the bytes and what it means; how
+the bytes are collected, timed and given up is the same and stands here. A stream that has once been out of step is
+never read further: the connection is dropped, and the next question opens a new one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import select
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Protocol, TypeVar
+from xml.etree import ElementTree
+
+from weldscan.errors import DeviceError, DeviceTimeout, InputError
+
+T = TypeVar("T")
+Cut = Callable[[bytearray], bytes | None]
+"""Takes one whole message off the front of the buffer; None while it is incomplete; `DeviceError` on nonsense."""
+
+LARGEST_MESSAGE = 65_536
+"""Bytes: the largest message of any link here has about 1,000."""
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
+"""Back-off between attempts to reconnect: doubled from the first to the longest."""
+
+
+class ConnectionLost(DeviceError):
+    """The other side refused, closed or reset the connection; a question without side effects may be asked again."""
+
+
+class Transport(Protocol):
+    """A byte stream. Times are `time.monotonic()` deadlines."""
+
+    def send(self, data: bytes, deadline_s: float) -> None:
+        """Send all of it."""
+
+    def receive(self, deadline_s: float) -> bytes:
+        """Wait for at least one byte."""
+
+    def close(self) -> None:
+        """Close it."""
+
+
+class TcpTransport:
+    """A TCP connection."""
+
+    def __init__(self, peer: socket.socket, name: str) -> None:
+        peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket, self._name = peer, name
+
+    @classmethod
+    def connect(cls, host: str, port: int, deadline_s: float) -> TcpTransport:
+        """Open a connection, or say who did not answer."""
+        name = f"{host}:{port}"
+        try:
+            return cls(socket.create_connection((host, port), _remaining(deadline_s)), name)
+        except (TimeoutError, BlockingIOError) as error:
+            raise DeviceTimeout(f"{name}: no answer to the connection request") from error
+        except OSError as error:
+            raise ConnectionLost(f"{name}: cannot connect: {error.strerror or error}") from error
+
+    def send(self, data: bytes, deadline_s: float) -> None:
+        """Send all of it."""
+        try:
+            self._socket.settimeout(_remaining(deadline_s))
+            self._socket.sendall(data)
+        except (TimeoutError, BlockingIOError) as error:
+            raise DeviceTimeout(f"{self._name}: does not take what is sent") from error
+        except OSError as error:
+            raise ConnectionLost(f"{self._name}: connection lost: {error.strerror or error}") from error
+
+    def receive(self, deadline_s: float) -> bytes:
+        """Wait for at least one byte."""
+        try:
+            self._socket.settimeout(_remaining(deadline_s))
+            data = self._socket.recv(LARGEST_MESSAGE)
+        except (TimeoutError, BlockingIOError) as error:
+            raise DeviceTimeout(f"{self._name}: no whole answer in time") from error
+        except OSError as error:
+            raise ConnectionLost(f"{self._name}: connection lost: {error.strerror or error}") from error
+        if not data:
+            raise ConnectionLost(f"{self._name}: the other side closed the connection")
+        return data
+
+    def close(self) -> None:
+        """Close it."""
+        with contextlib.suppress(OSError):  # wakes a thread that waits in receive()
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+
+
+class FileTransport:
+    """A file descriptor that is read and written, such as one end of a pseudo-terminal."""
+
+    def __init__(self, descriptor: int, name: str) -> None:
+        self._fd, self._name = descriptor, name
+
+    def send(self, data: bytes, deadline_s: float) -> None:
+        """Send all of it."""
+        while data:
+            if not select.select([], [self._fd], [], _remaining(deadline_s))[1]:
+                raise DeviceTimeout(f"{self._name}: does not take what is sent")
+            data = data[os.write(self._fd, data[:1024]) :]
+
+    def receive(self, deadline_s: float) -> bytes:
+        """Wait for at least one byte."""
+        try:
+            if not select.select([self._fd], [], [], _remaining(deadline_s))[0]:
+                raise DeviceTimeout(f"{self._name}: no whole answer in time")
+            data = os.read(self._fd, LARGEST_MESSAGE)
+        except (OSError, ValueError) as error:
+            if isinstance(error, DeviceTimeout):
+                raise
+            raise ConnectionLost(f"{self._name}: {error}") from error
+        if not data:
+            raise ConnectionLost(f"{self._name}: closed")
+        return data
+
+    def close(self) -> None:
+        """Close it."""
+        os.close(self._fd)
+
+
+class Messages:
+    """Whole messages from a transport, however the bytes were split or joined on their way."""
+
+    def __init__(self, transport: Transport, cut: Cut) -> None:
+        self.transport, self._cut, self._buffer = transport, cut, bytearray()
+
+    def next(self, deadline_s: float) -> bytes:
+        """Wait for one whole message."""
+        while (message := self._cut(self._buffer)) is None:
+            if len(self._buffer) > LARGEST_MESSAGE:
+                raise DeviceError(f"a message of more than {LARGEST_MESSAGE} bytes without an end")
+            self._buffer += self.transport.receive(deadline_s)
+        return message
+
+    def unasked(self) -> bool:
+        """Is there anything that nobody asked for, a line end apart?"""
+        if self._buffer:
+            return True
+        try:
+            return bool(self.transport.receive(time.monotonic()).strip())
+        except DeviceTimeout:
+            return False
+
+
+class Link:
+    """Asks one question at a time, within a time-out, over a connection that is opened when it is needed.
+
+    A question that may be repeated (reading has no side effects) survives a lost connection: it is asked again after a
+    growing pause until `reconnect_s` have passed. Silence and nonsense are never repeated but raised.
+    """
+
+    def __init__(
+        self, name: str, connect: Callable[[float], Transport], cut: Cut, timeout_s: float, reconnect_s: float
+    ) -> None:
+        self.name, self.timeout_s, self.reconnect_s = name, timeout_s, reconnect_s
+        self._connect, self._cut = connect, cut
+        self._messages: Messages | None = None
+        self._lock = threading.Lock()
+        self.last_used_s = time.monotonic()
+
+    def open(self) -> None:
+        """Connect now, so that a wrong address is told at once."""
+        with self._lock:
+            try:
+                self._stream(time.monotonic() + self.timeout_s)
+            except DeviceError as error:
+                raise type(error)(f"{self.name}: {error}") from error
+
+    def ask(self, request: bytes, read: Callable[[bytes], T], repeat: bool = True, timeout_s: float | None = None) -> T:
+        """Send the request and give what `read` makes of the one reply.
+
+        `read` raises `DeviceError` or `InputError` on a reply that is not the answer.
+        """
+        with self._lock:
+            give_up_s = time.monotonic() + self.reconnect_s
+            pause_s = FIRST_PAUSE_S
+            while True:
+                deadline_s = time.monotonic() + (self.timeout_s if timeout_s is None else timeout_s)
+                try:
+                    messages = self._stream(deadline_s)
+                    messages.transport.send(request, deadline_s)
+                    answer = read(messages.next(deadline_s))
+                    self.last_used_s = time.monotonic()
+                    return answer
+                except ConnectionLost as error:
+                    self._drop()
+                    if not repeat or time.monotonic() + pause_s > give_up_s:
+                        raise type(error)(f"{self.name}: {error}") from error
+                except (DeviceError, InputError) as error:
+                    self._drop()
+                    kind = type(error) if isinstance(error, DeviceError) else DeviceError
+                    raise kind(f"{self.name}: {error}") from error
+                except BaseException:
+                    self._drop()
+                    raise
+                time.sleep(pause_s)
+                pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+
+    def close(self) -> None:
+        """Close the connection."""
+        with self._lock:
+            self._drop()
+
+    def _stream(self, deadline_s: float) -> Messages:
+        if self._messages is not None:
+            with contextlib.suppress(ConnectionLost):
+                if not self._messages.unasked():
+                    return self._messages
+            self._drop()  # the other side closed it or talks out of turn
+        self._messages = Messages(self._connect(deadline_s), self._cut)
+        return self._messages
+
+    def _drop(self) -> None:
+        if self._messages is not None:
+            with contextlib.suppress(OSError):
+                self._messages.transport.close()
+            self._messages = None
+
+
+_ROOT = re.compile(rb"\s*(?:<\?xml[^<>]*\?>\s*)?<([A-Za-z_][\w.-]*)")
+
+
+def cut_xml(buffer: bytearray) -> bytes | None:
+    """Cut one XML document, which ends with the closing tag of its root; no DTD, no comment, no CDATA."""
+    if b"<!" in buffer:
+        raise DeviceError("XML with a DTD, entity, comment or CDATA section is refused")
+    root = _ROOT.match(buffer)
+    if root is None:
+        if buffer.strip() and (not buffer.lstrip().startswith(b"<") or len(buffer) > 256):
+            raise DeviceError(f"not XML: {bytes(buffer[:40])!r}")
+        return None
+    name = re.escape(root[1])
+    end = re.compile(rb"(?:[^<>]*/>|[\s>].*?</" + name + rb"\s*>)", re.DOTALL).match(buffer, root.end())
+    if end is None:
+        return None
+    message = bytes(buffer[: end.end()]).lstrip()
+    del buffer[: end.end()]
+    del buffer[: len(buffer) - len(buffer.lstrip())]
+    return message
+
+
+def parse_xml(data: bytes, root: str) -> ElementTree.Element:
+    """Parse a document that an outsider sent: small, without DTD and entities, and with the expected root."""
+    if len(data) > LARGEST_MESSAGE:
+        raise DeviceError(f"XML of {len(data)} bytes is refused")
+    if b"<!" in data:
+        raise DeviceError("XML with a DTD, entity, comment or CDATA section is refused")
+    try:
+        element = ElementTree.fromstring(data)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise DeviceError(f"not XML: {error}: {data[:40]!r}") from error
+    if element.tag != root:
+        raise DeviceError(f"XML with the root <{element.tag}>, expected <{root}>")
+    return element
+
+
+def _remaining(deadline_s: float) -> float:
+    """Seconds left. Zero means to a socket: what is there already, without waiting."""
+    return max(deadline_s - time.monotonic(), 0.0)

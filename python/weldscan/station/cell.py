@@ -1,0 +1,75 @@
+"""The configuration of a cell, `cell.toml`: which robot, camera and projector there are and how they are reached."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from weldscan.devices import BACKENDS, backend
+from weldscan.devices.robot import Robot
+from weldscan.errors import InputError
+from weldscan.session import explain
+
+M = TypeVar("M", bound=BaseModel)
+SELECTOR = {"robot": "link", "camera": "backend", "projector": "backend"}
+"""The field of a section that names its backend."""
+
+
+class CellConfig(BaseModel):
+    """The sections of `cell.toml`; each is checked by the backend that it names when that is opened."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+    name: str = "cell"
+    robot: dict[str, Any] | None = None
+    camera: dict[str, Any] | None = None
+    projector: dict[str, Any] | None = None
+    scan: dict[str, Any] = {}
+    _path: Path = Path("cell.toml")
+
+    @property
+    def path(self) -> Path:
+        """Where it was read from; file names in it are relative to its folder."""
+        return self._path
+
+    def open(self, kind: str, **extra: Any) -> Any:
+        """Open the cell's robot, camera or projector."""
+        section = getattr(self, kind)
+        if section is None:
+            raise InputError(f"{self.path}: {kind}: missing")
+        selector = SELECTOR[kind]
+        name = section.get(selector)
+        if name not in BACKENDS[kind]:
+            raise InputError(f"{self.path}: {kind}.{selector}: {name!r} is none of {', '.join(BACKENDS[kind])}")
+        device = backend(kind, name)
+        return device(check(section, device.Settings, f"{self.path}: {kind}"), **extra)
+
+    def open_robot(self) -> Robot:
+        """Open the robot."""
+        robot: Robot = self.open("robot")
+        return robot
+
+
+def read_cell(path: Path) -> CellConfig:
+    """Read `cell.toml`; a wrong field is named in an `InputError`."""
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not TOML: {error}") from None
+    config = check(document, CellConfig, str(path))
+    config._path = path
+    return config
+
+
+def check(section: Mapping[str, Any], model: type[M], where: str) -> M:
+    """Return the section as its model, or name what is wrong in it."""
+    try:
+        return model.model_validate(section)
+    except ValidationError as error:
+        raise InputError(f"{where}: {explain(error)}") from None

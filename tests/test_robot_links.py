@@ -1,0 +1,386 @@
+"""Every link against its simulated controller: poses, motion, and one fault after the other."""
+
+import math
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from weldscan import DeviceError, DeviceTimeout, KukaPose
+from weldscan.devices.controller import Arm, Fault
+from weldscan.devices.eki import EkiController, EkiRobot, EkiSettings
+from weldscan.devices.kvp import KvpController, KvpRobot, KvpSettings
+from weldscan.devices.robot import distance, wait_until_still
+from weldscan.devices.rsi import RsiController, RsiRobot, RsiSettings
+from weldscan.devices.serial import SerialController, SerialRobot, SerialSettings
+
+TIMEOUT_S = 0.6
+LATE_S = 0.7
+"""How far beyond its time-out an error may come: a machine that others load too."""
+WIRE_MM, WIRE_DEG = 1e-5, 1e-5
+"""Serial and RSI print six decimals."""
+
+FLANGE = KukaPose(610.825, -148.476, 481.652, -29.008, 23.236, 74.641)
+TOOL = KukaPose(12.5, -3.25, 180.0, 15.0, -40.0, 5.0)
+BASE = KukaPose(900.0, 250.0, -120.0, 35.0, 4.0, -7.0)
+NEAR = KukaPose(612.825, -147.476, 483.652, -28.008, 23.736, 74.141)
+READS = 9
+"""Questions per pose of the KVP link at most."""
+
+STREAMS = ("kvp", "c3", "eki", "serial")
+LINKS = (*STREAMS, "rsi")
+
+
+def connect(link, arm, **settings):
+    """A simulated controller and a robot that talks to it."""
+    settings = {"timeout_s": TIMEOUT_S, "reconnect_s": 4.0, **settings}
+    if link == "rsi":
+        robot = RsiRobot(RsiSettings(port=0, tool=TOOL.values(), base=BASE.values(), **settings))
+        return RsiController(arm, port=robot.port, cycle_s=0.004), robot
+    if link == "eki":
+        controller = EkiController(arm)
+        return controller, EkiRobot(EkiSettings(port=controller.port, **settings))
+    if link == "serial":
+        controller = SerialController(arm)
+        return controller, SerialRobot(SerialSettings(port=controller.port, **settings))
+    controller = KvpController(arm, c3=link == "c3")
+    dialect = "c3" if link == "c3" else "kukavarproxy"
+    return controller, KvpRobot(KvpSettings(port=controller.port, dialect=dialect, **settings))
+
+
+@pytest.fixture
+def arm():
+    return Arm(FLANGE, TOOL, BASE)
+
+
+@pytest.fixture
+def cell(request, arm):
+    link, settings = request.param if isinstance(request.param, tuple) else (request.param, {})
+    controller, robot = connect(link, arm, **settings)
+    with controller, robot:
+        yield controller, robot
+
+
+every_link = pytest.mark.parametrize("cell", LINKS, indirect=True)
+every_stream = pytest.mark.parametrize("cell", STREAMS, indirect=True)
+moving_cells = pytest.mark.parametrize(
+    "cell", [(link, {"allow_motion": True, "move_timeout_s": 1.5}) for link in STREAMS], ids=STREAMS, indirect=True
+)
+
+
+def close_to(a, b):
+    mm, deg = distance(a, b)
+    return mm < WIRE_MM and deg < WIRE_DEG
+
+
+@every_link
+def test_flange_whichever_tool_and_base(cell, arm):
+    _, robot = cell
+    for base in (BASE, KukaPose(0, 0, 0, 0, 0, 0)) if not isinstance(robot, RsiRobot) else (BASE,):
+        arm.base = base
+        before = time.monotonic()
+        pose = robot.pose()
+        assert close_to(pose.flange, FLANGE)
+        assert before <= pose.time_s <= time.monotonic()
+    assert robot.joints() == pytest.approx(arm.joints_deg)
+
+
+@every_link
+def test_follows_the_arm(cell, arm):
+    _, robot = cell
+    robot.pose()
+    time.sleep(0.05)
+    arm.place(NEAR)
+    time.sleep(0.02)
+    assert close_to(robot.pose().flange, NEAR)
+    arm.move(FLANGE)
+    seen = robot.pose().flange
+    assert not close_to(seen, NEAR) or not arm.moving
+
+
+@every_stream
+def test_tool_fixed_in_the_room_is_refused(cell, arm):
+    arm.interpolation = "#TCP"
+    with pytest.raises(DeviceError, match="IPO_MODE"):
+        cell[1].pose()
+
+
+@every_link
+def test_out_of_this_world(cell, arm):
+    arm.place(KukaPose(50_000, 0, 0, 0, 0, 0))
+    time.sleep(0.02)
+    with pytest.raises(DeviceError, match="cannot be"):
+        cell[1].pose()
+
+
+def test_tool_that_keeps_changing(arm):
+    controller, robot = connect("kvp", arm)
+    with controller, robot:
+        stop = threading.Event()
+
+        def switch():
+            while not stop.wait(0.0003):
+                arm.tool = KukaPose(np.random.default_rng().uniform(0, 9), 0, 0, 0, 0, 0)
+
+        thread = threading.Thread(target=switch)
+        thread.start()
+        try:
+            for _ in range(5):
+                try:
+                    assert math.isfinite(robot.pose().flange.x_mm)
+                except DeviceError as error:
+                    assert "keep changing" in str(error) or "jumped" in str(error)
+        finally:
+            stop.set()
+            thread.join()
+
+
+# --- motion -----------------------------------------------------------------------------------------------------------
+
+
+@every_link
+def test_motion_is_off_by_default(cell, arm):
+    with pytest.raises(DeviceError, match="motion is off"):
+        cell[1].move_to(NEAR)
+    assert close_to(arm.flange(), FLANGE)
+
+
+@moving_cells
+def test_moves_and_arrives(cell, arm):
+    pose = cell[1].move_to(NEAR)
+    assert distance(pose.flange, NEAR)[0] < 0.1
+    assert close_to(arm.flange(), NEAR)
+
+
+@moving_cells
+@pytest.mark.parametrize("mode", ["#T2", "#AUT", "#EX"])
+def test_motion_only_in_t1(cell, arm, mode):
+    arm.mode = mode
+    with pytest.raises(DeviceError, match="only in T1"):
+        cell[1].move_to(NEAR)
+    assert close_to(arm.flange(), FLANGE)
+
+
+@moving_cells
+def test_far_targets_are_refused(cell, arm):
+    with pytest.raises(DeviceError, match="largest_move_mm"):
+        cell[1].move_to(KukaPose(1610.825, *FLANGE.values()[1:]))
+    assert close_to(arm.flange(), FLANGE)
+
+
+@moving_cells
+def test_word_of_arrival_is_not_believed(cell, arm, monkeypatch):
+    monkeypatch.setattr(arm, "move", lambda target: None)  # says done, and stays where it is
+    with pytest.raises(DeviceTimeout, match="from the target"):
+        cell[1].move_to(NEAR)
+
+
+@moving_cells
+def test_stale_pose_is_no_arrival(cell, arm):
+    controller, robot = cell
+    controller.inject(Fault.STALE, 100_000)
+    with pytest.raises(DeviceTimeout):
+        robot.move_to(NEAR)
+
+
+def test_rsi_never_moves(arm):
+    controller, robot = connect("rsi", arm, allow_motion=True)
+    with controller, robot, pytest.raises(DeviceError):
+        robot.move_to(NEAR)
+
+
+@pytest.mark.parametrize("state", [("$PRO_STATE1", "#P_STOP"), ("$PRO_NAME1[]", '"OTHER"')])
+def test_kvp_needs_our_program_running(arm, state):
+    controller, robot = connect("kvp", arm, allow_motion=True)
+    with controller, robot:
+        controller.variables[state[0]] = state[1]
+        with pytest.raises(DeviceError, match="must be running"):
+            robot.move_to(NEAR)
+        assert close_to(arm.flange(), FLANGE)
+
+
+def test_still(arm):
+    controller, robot = connect("eki", arm)
+    with controller, robot:
+        wait_until_still(robot, 0.1, 0.02, 0.01, 1.0)
+        arm.speed_mm_s = 5.0
+        arm.move(KukaPose(660.825, *FLANGE.values()[1:]))
+        with pytest.raises(DeviceTimeout, match="stand still"):
+            wait_until_still(robot, 0.1, 0.02, 0.01, 0.5)
+
+
+# --- faults: every one ends in a typed error or a recovered pose, in time, and never in a wrong pose ------------------
+
+RECOVERED = (Fault.BYTES, Fault.TWICE, Fault.RESET, Fault.RESTART)
+TIMED_OUT = (Fault.SILENCE,)
+REFUSED = (Fault.WRONG_ID, Fault.WRONG_LENGTH, Fault.EMPTY, Fault.GARBAGE, Fault.HUGE, Fault.NAN, Fault.JUMP)
+XML_ONLY = (Fault.DTD, Fault.ENTITY)
+
+
+def reads_within(robot, seconds):
+    start = time.monotonic()
+    try:
+        return robot.pose().flange
+    finally:
+        assert time.monotonic() - start < seconds + LATE_S
+
+
+def looks_unfinished(controller, fault):
+    """Is more to be waited for, so that a time-out is the right answer?"""
+    return (isinstance(controller, KvpController) and fault is Fault.GARBAGE) or (
+        isinstance(controller, EkiController) and fault is Fault.WRONG_LENGTH
+    )
+
+
+def wait_for_quiet_line(robot):
+    """10 MB take their time on a serial line: until they are through, every question ends in a typed error."""
+    give_up_s = time.monotonic() + 30.0
+    while time.monotonic() < give_up_s:
+        try:
+            robot.pose()
+            return
+        except DeviceError:
+            time.sleep(0.05)
+
+
+@every_stream
+@pytest.mark.parametrize("fault", RECOVERED)
+def test_recovers(cell, fault):
+    controller, robot = cell
+    if isinstance(controller, SerialController) and fault is Fault.RESET:
+        pytest.skip("a serial line knows no reset: half a reply is silence")
+    controller.restart_s = 0.5
+    controller.inject(fault)
+    if isinstance(controller, SerialController) and fault is Fault.RESTART:
+        with pytest.raises(DeviceTimeout):
+            robot.pose()
+    for _ in range(3):
+        assert close_to(reads_within(robot, 4.0), FLANGE)
+
+
+@every_stream
+@pytest.mark.parametrize("fault", REFUSED + TIMED_OUT + XML_ONLY)
+def test_refused_and_then_right_again(cell, fault):
+    controller, robot = cell
+    if fault in XML_ONLY and not isinstance(controller, EkiController):
+        pytest.skip("no XML on this link")
+    robot.pose()
+    controller.inject(fault, READS)
+    kind = DeviceTimeout if fault in TIMED_OUT else DeviceError
+    with pytest.raises(kind) as caught:
+        reads_within(robot, TIMEOUT_S)
+    if fault in REFUSED and not looks_unfinished(controller, fault):
+        assert not isinstance(caught.value, DeviceTimeout), caught.value
+    assert robot.name in str(caught.value)
+    controller._faults.clear()
+    if fault is Fault.JUMP:
+        time.sleep(0.05)  # 400 mm back is a jump too, until there was time for it
+    if fault is Fault.HUGE and isinstance(controller, SerialController):
+        wait_for_quiet_line(robot)
+    assert close_to(reads_within(robot, TIMEOUT_S), FLANGE)
+
+
+@pytest.mark.parametrize("fault", [Fault.GARBAGE, Fault.EMPTY, Fault.NAN, Fault.HUGE, Fault.DTD, Fault.ENTITY])
+def test_rsi_bad_packets(arm, fault):
+    controller, robot = connect("rsi", arm)
+    with controller, robot:
+        robot.pose()
+        controller.inject(fault, 10_000)
+        time.sleep(0.02)
+        with pytest.raises(DeviceError):
+            reads_within(robot, TIMEOUT_S)
+        controller._faults.clear()
+        time.sleep(0.02)
+        assert close_to(reads_within(robot, TIMEOUT_S), FLANGE)
+
+
+@pytest.mark.parametrize("fault", [Fault.SILENCE, Fault.STALE])
+def test_rsi_silence_and_a_stream_that_repeats_itself(arm, fault):
+    controller, robot = connect("rsi", arm)
+    with controller, robot:
+        robot.pose()
+        controller.inject(fault, 10_000)
+        time.sleep(0.02)
+        with pytest.raises(DeviceTimeout):
+            reads_within(robot, TIMEOUT_S)
+
+
+def test_rsi_jump_and_restart(arm):
+    controller, robot = connect("rsi", arm, timeout_s=2.0)
+    with controller, robot:
+        robot.pose()
+        controller.inject(Fault.RESTART)
+        time.sleep(0.02)
+        assert close_to(reads_within(robot, 2.0), FLANGE)
+        controller.inject(Fault.JUMP, 50)
+        with pytest.raises(DeviceError, match="jumped"):
+            for _ in range(20):
+                robot.pose()
+
+
+def test_rsi_listens_to_its_controller_alone(arm):
+    robot = RsiRobot(RsiSettings(port=0, timeout_s=0.3, controller="127.0.0.9"))
+    with robot, RsiController(arm, port=robot.port), pytest.raises(DeviceTimeout):
+        robot.pose()
+
+
+@pytest.mark.parametrize("link", ["kvp", "eki"])
+def test_connection_refused(link):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    start = time.monotonic()
+    with pytest.raises(DeviceError, match=str(port)):
+        KvpRobot(KvpSettings(port=port)) if link == "kvp" else EkiRobot(EkiSettings(port=port))
+    assert time.monotonic() - start < 1.0 + LATE_S
+
+
+def test_serial_port_missing():
+    with pytest.raises(DeviceError, match="cannot open"):
+        SerialRobot(SerialSettings(port="/dev/nothing-here"))
+
+
+@pytest.mark.parametrize("link", ["kvp", "eki", "serial"])
+def test_controller_gone_for_good(link, arm):
+    controller, robot = connect(link, arm, reconnect_s=1.0)
+    with robot:
+        robot.pose()
+        controller.close()
+        with pytest.raises(DeviceError):
+            reads_within(robot, 1.0 + TIMEOUT_S)
+
+
+def test_rsi_port_taken():
+    with RsiRobot(RsiSettings(port=0)) as first, pytest.raises(DeviceError, match="cannot listen"):
+        RsiRobot(RsiSettings(port=first.port))
+
+
+@every_link
+def test_clock_going_back(cell, monkeypatch):
+    monkeypatch.setattr(time, "time", lambda: 0.0)
+    monkeypatch.setattr(time, "time_ns", lambda: 0)
+    assert close_to(cell[1].pose().flange, FLANGE)
+
+
+@every_stream
+def test_many_threads_one_robot(cell):
+    _, robot = cell
+    results = []
+    threads = [threading.Thread(target=lambda: results.append(robot.read().flange())) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(results) == 8
+    assert all(close_to(flange, FLANGE) for flange in results)
+
+
+def test_heartbeat(arm, monkeypatch):
+    monkeypatch.setattr("weldscan.devices.kvp.HEARTBEAT_S", 0.1)
+    controller, robot = connect("kvp", arm)
+    with controller, robot:
+        robot.pose()
+        before = robot._number
+        time.sleep(0.5)
+        assert robot._number > before

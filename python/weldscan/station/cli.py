@@ -151,4 +151,3 @@ def _show(pose: StampedPose, to_a_person: bool) -> None:
         print("  ".join(f"{name} {value:10.3f}" for name, value in values.items()), flush=True)
     else:
         print(json.dumps({**values, "time_s": pose.time_s}), flush=True)
-

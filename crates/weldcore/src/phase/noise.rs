@@ -8,8 +8,10 @@
 //! background itself must do, and the surface's texture counts as noise (an upper bound).
 //!
 //! What is left of smooth model errors goes away in the difference between neighbours, taken across or along the image,
-//! whichever is quieter: along a fringe the phase hardly changes. The variances are found per band of grey level, with
-//! outliers clipped (edges, wrong pixels), and a line is fitted to them.
+//! whichever is quieter: along a fringe the phase hardly changes. Everything else that such a difference may hold
+//! (edges, glints, movement, light that flickers between walls) only adds to it. So the variance is taken from small
+//! runs of pixels, the quiet tenth of the runs speaks for its band of grey levels, corrected by the quantile of chi²,
+//! and a line is fitted to the bands.
 
 use super::wave::Level;
 use super::{FringeSet, Shot};
@@ -21,12 +23,13 @@ pub(crate) const ROUNDING: f64 = 1.0 / 12.0;
 const ROW_PAIRS: usize = 24;
 /// Bands of grey level.
 const BANDS: usize = 16;
-/// A band with fewer samples says nothing.
-const FEWEST: usize = 64;
-/// Samples beyond this many standard deviations are outliers, and this is the share of a normal distribution's variance
-/// that lies within.
-const CLIP: f64 = 3.0;
-const CLIPPED_SHARE: f64 = 0.973_34;
+/// Differences in a run.
+const RUN: usize = 16;
+/// A band with fewer runs says nothing.
+const FEWEST: usize = 20;
+/// The quantile of the runs' variances that speaks for them, and where chi² over its 16 degrees of freedom has it.
+const QUIET: f64 = 0.1;
+const QUIET_CHI2: f64 = 0.582_0;
 /// A band that misses the line by this share of its variance counts half: bands that few surfaces fill may hold little
 /// but edges.
 const BAND_MISS: f64 = 0.5;
@@ -110,54 +113,53 @@ fn contrasts(sets: &[FringeSet]) -> (Vec<Contrast>, NoiseSource) {
     (pairs.collect(), NoiseSource::Backgrounds)
 }
 
-/// Squared neighbour differences by grey level, scaled to the variance of one sample.
+/// Variances of runs of neighbour differences, by grey level.
 #[derive(Default)]
 struct Bands {
-    samples: [Vec<f32>; BANDS],
-    levels: [f64; BANDS],
+    /// Level and mean square of each run.
+    runs: [Vec<(f64, f64)>; BANDS],
+    /// The run that is being filled: count, sum of levels, sum of squares.
+    open: (usize, f64, f64),
 }
 
 impl Bands {
-    fn add(&mut self, level: f32, top: f32, difference: f32) {
-        let band = ((level / top * BANDS as f32) as usize).min(BANDS - 1);
-        if let (Some(samples), Some(sum)) = (self.samples.get_mut(band), self.levels.get_mut(band)) {
-            samples.push(difference);
-            *sum += f64::from(level);
+    fn add(&mut self, level: f32, difference: f32, top: f32) {
+        let (count, levels, squares) = &mut self.open;
+        *count += 1;
+        *levels += f64::from(level);
+        *squares += f64::from(difference).powi(2);
+        if *count == RUN {
+            let (level, square) = (*levels / RUN as f64, *squares / RUN as f64);
+            let band = ((level / f64::from(top) * BANDS as f64) as usize).min(BANDS - 1);
+            if let Some(runs) = self.runs.get_mut(band) {
+                runs.push((level, square));
+            }
+            self.open = (0, 0.0, 0.0);
         }
     }
 
-    /// (level, variance, count) of each band.
-    fn variances(mut self) -> Vec<(f64, f64, f64)> {
-        let bands = self.samples.iter_mut().zip(self.levels);
-        bands
-            .filter(|(samples, _)| samples.len() >= FEWEST)
-            .map(|(samples, sum)| (sum / samples.len() as f64, clipped_variance(samples), samples.len() as f64))
-            .collect()
+    /// A run holds neighbours only: it ends where the pixels do.
+    fn end_run(&mut self) {
+        self.open = (0, 0.0, 0.0);
+    }
+
+    /// (level, variance, count) of each band; of all together where no band has enough.
+    fn variances(self) -> Vec<(f64, f64, f64)> {
+        let (full, sparse): (Vec<_>, Vec<_>) = self.runs.into_iter().partition(|runs| runs.len() >= FEWEST);
+        if full.is_empty() {
+            let all = sparse.concat();
+            return if all.is_empty() { Vec::new() } else { vec![quiet(all)] };
+        }
+        full.into_iter().map(quiet).collect()
     }
 }
 
-/// The variance of the bulk of the samples, whose mean is zero.
-fn clipped_variance(samples: &mut [f32]) -> f64 {
-    let middle = samples.len() / 2;
-    for s in samples.iter_mut() {
-        *s = s.abs();
-    }
-    let median = f64::from(*samples.select_nth_unstable_by(middle, f32::total_cmp).1);
-    // Coarse rounding can make the median zero: then start from everything.
-    let mut variance = if median > 0.0 { (median / 0.6745).powi(2) } else { f64::INFINITY };
-    for _ in 0..8 {
-        let limit = (CLIP * variance.sqrt()) as f32;
-        let (sum, n) = samples.iter().filter(|&&s| s <= limit).fold((0.0, 0usize), |(sum, n), &s| {
-            let s = f64::from(s);
-            (sum + s * s, n + 1)
-        });
-        let next = sum / n.max(1) as f64 / if limit.is_finite() { CLIPPED_SHARE } else { 1.0 };
-        if (next - variance).abs() <= 1e-4 * variance {
-            break;
-        }
-        variance = next;
-    }
-    variance
+/// (level, variance, count) of the quiet tenth of the runs, of which there is one at least.
+fn quiet(mut runs: Vec<(f64, f64)>) -> (f64, f64, f64) {
+    let n = runs.len() as f64;
+    let level = runs.iter().map(|r| r.0).sum::<f64>() / n;
+    let variance = runs.select_nth_unstable_by((QUIET * n) as usize, |a, b| a.1.total_cmp(&b.1)).1.1;
+    (level, variance / QUIET_CHI2, n)
 }
 
 /// The line through the bands: variance = floor + gain · level, floor at least that of rounding, gain at least zero.
@@ -266,12 +268,21 @@ impl Row {
 fn pair_differences(pair: &[Row; 2], saturation: f32, across: &mut Bands, along: &mut Bands) {
     let [upper, lower] = pair;
     for i in 0..upper.value.len() {
-        let Some((here, level)) = upper.at(i, saturation) else { continue };
+        let Some((here, level)) = upper.at(i, saturation) else {
+            across.end_run();
+            along.end_run();
+            continue;
+        };
         if let Some((below, other)) = lower.at(i, saturation) {
-            along.add(0.5 * (level + other), saturation, here - below);
+            along.add(0.5 * (level + other), here - below, saturation);
         }
-        if let Some((right, other)) = upper.at(i + 1, saturation) {
-            across.add(0.5 * (level + other), saturation, here - right);
+        // Every other pixel, so that no two differences share one.
+        if i % 2 == 0
+            && let Some((right, other)) = upper.at(i + 1, saturation)
+        {
+            across.add(0.5 * (level + other), here - right, saturation);
         }
     }
+    across.end_run();
+    along.end_run();
 }

@@ -108,7 +108,7 @@ class Weld:
     reference: Wall
     other: Wall
     bead: Bead = field(default_factory=Bead)
-    length_mm: float = 300.0
+    length_mm: float = 600.0
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def pipe(
     ovality_at_deg: float = 0.0,
     waviness_mm: float = 0.005,
     bead: Bead | None = None,
-    length_mm: float = 300.0,
+    length_mm: float = 600.0,
 ) -> Weld:
     """Return two pipes welded end to end, the other one's axis moved, tilted, wider and out of round as given.
 
@@ -168,7 +168,7 @@ def pipe(
     return Weld(Wall(diameter_mm / 2, waviness_mm=waviness_mm), other, Bead() if bead is None else bead, length_mm)
 
 
-def plates(step_mm: float = 0.5, *, angle_deg: float = 0.0, bead: Bead | None = None, length_mm: float = 300.0) -> Weld:
+def plates(step_mm: float = 0.5, *, angle_deg: float = 0.0, bead: Bead | None = None, length_mm: float = 600.0) -> Weld:
     """Return two plates butt-welded, the other one `step_mm` higher and tilted: a pipe of infinite radius."""
     other = Wall(math.inf, offset_mm=(step_mm, 0.0), tilt_rad=(math.radians(angle_deg), 0.0))
     return Weld(Wall(math.inf), other, Bead() if bead is None else bead, length_mm)

@@ -2,15 +2,17 @@
 
 use std::sync::Arc;
 
-use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1};
-use pyo3::exceptions::PyTypeError;
+use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::exceptions::{PyAttributeError, PyTypeError};
 use pyo3::prelude::*;
 
 use super::scanner::PyScanner;
-use super::{compute, float_matrix, raise, transform};
+use super::{compute, float_matrix, floats, raise, raise_as, transform};
 use crate::error::Error;
 use crate::scanner::Rays;
-use crate::simulate::{Axis, Bead, Body, Frames, FringeSet, Photometry, Sample, Shape, Surface, Wall, Weld, simulate};
+use crate::simulate::{
+    Axis, Bead, Body, Frames, FringeSet, Photometry, Sample, Shape, Shot, Surface, Wall, Weld, simulate,
+};
 use crate::transform::Transform;
 
 #[derive(FromPyObject)]
@@ -95,7 +97,7 @@ fn shape(object: &Bound<'_, PyAny>) -> PyResult<Shape> {
             Shape::Stem { radius_mm: attribute("radius_mm")?.extract()?, length_mm: attribute("length_mm")?.extract()? }
         }
         "Weld" => Shape::Weld(Box::new(weld(object.py(), object.extract()?)?)),
-        _ => return Err(PyTypeError::new_err(format!("bodies: no shape is called {kind}"))),
+        _ => return Err(PyTypeError::new_err(format!("no shape is called {kind}"))),
     })
 }
 
@@ -110,12 +112,18 @@ fn body(object: &Bound<'_, PyAny>) -> PyResult<Body> {
     })
 }
 
+/// An object that lacks an attribute, or has one of the wrong type, is a wrong input.
+fn wrong_object(py: Python<'_>, what: &str, error: PyErr) -> PyErr {
+    let wrong = error.is_instance_of::<PyAttributeError>(py) || error.is_instance_of::<PyTypeError>(py);
+    if wrong { raise_as(py, "InputError", format!("{what}: {}", error.value(py))) } else { error }
+}
+
 /// One simulated shot: its images, and what each pixel's centre saw.
 #[pyclass(frozen, module = "weldscan", name = "SimulatedShot")]
 pub(crate) struct PyShot {
     height: usize,
     width: usize,
-    samples: Vec<Sample>,
+    shot: Shot,
     rays: Arc<Rays>,
     /// Per exposure the image under even light, (H, W) uint8 or uint16.
     #[pyo3(get)]
@@ -127,7 +135,7 @@ pub(crate) struct PyShot {
 
 impl PyShot {
     fn image<'py>(&self, py: Python<'py>, value: impl Fn(&Sample) -> f64) -> PyResult<Bound<'py, PyArray2<f64>>> {
-        let flat: Vec<f64> = self.samples.iter().map(value).collect();
+        let flat: Vec<f64> = self.shot.samples.iter().map(value).collect();
         flat.into_pyarray(py).reshape([self.height, self.width])
     }
 }
@@ -138,7 +146,7 @@ impl PyShot {
     #[getter]
     fn points_mm<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f64>>> {
         let rays = self.rays.x.iter().zip(&self.rays.y);
-        let points = self.samples.iter().zip(rays);
+        let points = self.shot.samples.iter().zip(rays);
         let flat: Vec<f64> = points.flat_map(|(s, (x, y))| [x * s.depth_mm, y * s.depth_mm, s.depth_mm]).collect();
         flat.into_pyarray(py).reshape([self.height, self.width, 3])
     }
@@ -170,8 +178,30 @@ impl PyShot {
     /// What each pixel sees, (H, W) uint8: the bodies' labels, 0 for the background.
     #[getter]
     fn labels<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<u8>>> {
-        let flat: Vec<u8> = self.samples.iter().map(|s| s.label).collect();
+        let flat: Vec<u8> = self.shot.samples.iter().map(|s| s.label).collect();
         flat.into_pyarray(py).reshape([self.height, self.width])
+    }
+
+    /// What the camera sees while the projector shows any picture.
+    ///
+    /// Args:
+    ///     picture: (H, W) uint8, of the projector's size.
+    ///     exposure: factor on the light.
+    ///     number: tells the noise of one frame from that of another.
+    ///
+    /// Returns:
+    ///     (H, W) uint8 or uint16, of the camera's size.
+    ///
+    /// Raises:
+    ///     InputError: the picture is not of the projector's size, the exposure is not above zero.
+    #[pyo3(signature = (picture, *, exposure=1.0, number=0))]
+    fn capture(&self, picture: PyReadonlyArray2<'_, u8>, exposure: f64, number: u32) -> PyResult<Py<PyAny>> {
+        let py = picture.py();
+        let pixels: Vec<u8> = picture.as_array().iter().copied().collect();
+        match compute(py, || self.shot.capture(&pixels, exposure, number))? {
+            Frames::Eight(frames) => array(py, frames.concat(), self.height, self.width),
+            Frames::Sixteen(frames) => array(py, frames.concat(), self.height, self.width),
+        }
     }
 
     fn __repr__(&self) -> String {
@@ -186,7 +216,7 @@ impl PyShot {
 ///     scanner: `Scanner`.
 ///     scene_from_scanner: (4, 4), where the scanner (its camera) stands in the scene, mm.
 ///     bodies: what stands in the scene: `weldscan.devices.simulated.Body`.
-///     fringes: sets of (axis "x" or "y", periods, steps).
+///     fringes: sets of (axis "x" or "y", periods, steps); none for white images alone.
 ///     photometry: lamp, room, projector and sensor: `weldscan.devices.simulated.Photometry`.
 ///     exposures: factors on the light, one stack of frames each.
 ///     seed: start of the random numbers.
@@ -220,7 +250,11 @@ fn simulate_shot(
 ) -> PyResult<PyShot> {
     let py = scanner.py();
     let pose: Transform = transform("scene_from_scanner", &float_matrix("scene_from_scanner", scene_from_scanner)?)?;
-    let bodies = bodies.iter().map(body).collect::<PyResult<Vec<_>>>()?;
+    let bodies = bodies
+        .iter()
+        .enumerate()
+        .map(|(i, b)| body(b).map_err(|e| wrong_object(py, &format!("bodies[{i}]"), e)))
+        .collect::<PyResult<Vec<_>>>()?;
     let axis = |name: &str| match name {
         "x" => Ok(Axis::X),
         "y" => Ok(Axis::Y),
@@ -247,12 +281,13 @@ fn simulate_shot(
         seed,
     };
     let scanner = &scanner.get().scanner;
-    let (shot, rays) = compute(py, || {
+    let (mut shot, rays) = compute(py, || {
         let shot = simulate(scanner, &pose, &bodies, &fringes, &exposures, &photometry)?;
         Ok((shot, scanner.camera_rays()))
     })?;
     let (height, width) = (scanner.camera.height, scanner.camera.width);
-    let mut images = match shot.frames {
+    let rendered = std::mem::replace(&mut shot.frames, Frames::Eight(Vec::new()));
+    let mut images = match rendered {
         Frames::Eight(frames) => frames.into_iter().map(|f| array(py, f, height, width)).collect::<PyResult<Vec<_>>>(),
         Frames::Sixteen(frames) => frames.into_iter().map(|f| array(py, f, height, width)).collect(),
     }?
@@ -260,7 +295,7 @@ fn simulate_shot(
     let steps = fringes.iter().map(|f| f.steps).sum();
     let stack = |_| (images.next(), images.by_ref().take(steps).collect());
     let (white, frames): (Vec<Option<_>>, Vec<_>) = exposures.iter().map(stack).unzip();
-    Ok(PyShot { height, width, samples: shot.samples, rays, white: white.into_iter().flatten().collect(), frames })
+    Ok(PyShot { height, width, shot, rays, white: white.into_iter().flatten().collect(), frames })
 }
 
 fn array<T: numpy::Element>(py: Python<'_>, flat: Vec<T>, height: usize, width: usize) -> PyResult<Py<PyAny>> {
@@ -276,6 +311,9 @@ fn array<T: numpy::Element>(py: Python<'_>, flat: Vec<T>, height: usize, width: 
 /// Returns:
 ///     (n,) float64, mm; positive where the other wall stands further out.
 ///
+/// Raises:
+///     InputError: a number is out of its range or not finite.
+///
 /// Example:
 ///     >>> import numpy as np
 ///     >>> from weldscan import simulated_step
@@ -284,12 +322,13 @@ fn array<T: numpy::Element>(py: Python<'_>, flat: Vec<T>, height: usize, width: 
 ///     >>> simulated_step(weld, np.array([0.0, np.pi])).round(6)
 ///     array([ 0.5, -0.5])
 #[pyfunction]
-fn simulated_step<'py>(
-    weld: &Bound<'py, PyAny>,
-    along: PyReadonlyArray1<'py, f64>,
-) -> PyResult<Bound<'py, PyArray1<f64>>> {
+fn simulated_step<'py>(weld: &Bound<'py, PyAny>, along: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyArray1<f64>>> {
     let py = weld.py();
-    let weld = self::weld(py, weld.extract()?)?;
+    let weld = self::weld(py, weld.extract().map_err(|e| wrong_object(py, "weld", e))?)?;
+    let along: PyReadonlyArray1<'py, f64> = floats("along", along)?;
+    if let Some(index) = along.as_array().iter().position(|a| !a.is_finite()) {
+        return Err(raise(py, &Error::NonFinite { what: "along", index }));
+    }
     let steps: Vec<f64> = along.as_array().iter().map(|&a| weld.step_at_seam(a)).collect();
     Ok(steps.into_pyarray(py))
 }

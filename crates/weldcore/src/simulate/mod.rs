@@ -22,7 +22,7 @@ use rayon::prelude::*;
 
 use crate::Vec3;
 use crate::error::{Error, Result, require_positive};
-use crate::scanner::Scanner;
+use crate::scanner::{Lens, Scanner};
 use crate::threads;
 use crate::transform::Transform;
 
@@ -92,7 +92,8 @@ pub struct Sample {
     pub column_px: f64,
     /// Its row.
     pub row_px: f64,
-    /// Height over the reference wall of a lit point of the other wall, mm; NaN elsewhere.
+    /// Height of the other wall over the reference wall at a lit point of the other wall, waviness left out, mm; NaN
+    /// elsewhere.
     pub deviation_mm: f64,
     /// Its angle about the axis, rad (plates: place along the seam, mm), for walls in the light; NaN elsewhere.
     pub along: f64,
@@ -131,12 +132,104 @@ pub struct Shot {
     pub frames: Frames,
     /// The truth, per pixel.
     pub samples: Vec<Sample>,
+    /// The rays of pixels on edges.
+    edges: Vec<(usize, [Sample; 4])>,
+    photometry: Photometry,
+    projector: Lens,
+}
+
+impl Shot {
+    /// What the camera sees while the projector shows any picture, 8 bits, row-major. `number` tells the noise of one
+    /// frame from that of another.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] for a picture that is not of the projector's size, [`Error::OutOfRange`] for the exposure.
+    pub fn capture(&self, picture: &[u8], exposure: f64, number: u32) -> Result<Frames> {
+        require_positive("exposure", exposure)?;
+        let (width, height) = (self.projector.width, self.projector.height);
+        if picture.len() != width * height {
+            let (expected, got) = (format!("{height} x {width} pixels"), format!("{} pixels", picture.len()));
+            return Err(Error::Shape { what: "picture", expected, got });
+        }
+        let light = Light::of(picture, width, height, &self.photometry);
+        let value = |s: &Sample| s.direct * light.at(s.column_px, s.row_px) + s.ambient;
+        let mut signal: Vec<f32> =
+            threads::map_chunks(&self.samples, |_, chunk| chunk.iter().map(value).collect::<Vec<_>>()).concat();
+        for (index, rays) in &self.edges {
+            if let Some(out) = signal.get_mut(*index) {
+                *out = 0.25 * rays.iter().map(value).sum::<f32>();
+            }
+        }
+        signal.iter_mut().for_each(|s| *s *= exposure as f32);
+        // The frames of `simulate` count from 0.
+        let stream = (1 << 32) | u64::from(number);
+        Ok(if self.photometry.bits == 8 {
+            Frames::Eight(vec![self.photometry.develop_all(stream, &signal)])
+        } else {
+            Frames::Sixteen(vec![self.photometry.develop_all(stream, &signal)])
+        })
+    }
+}
+
+/// The light that a picture throws, per projector pixel, blurred; between pixel centres it is interpolated.
+struct Light {
+    width: usize,
+    height: usize,
+    light: Vec<f32>,
+}
+
+impl Light {
+    fn of(picture: &[u8], width: usize, height: usize, photometry: &Photometry) -> Self {
+        let response: Vec<f32> = (0..=255u8).map(|g| (f64::from(g) / 255.0).powf(photometry.gamma) as f32).collect();
+        let shown: Vec<f32> = picture.iter().filter_map(|&g| response.get(usize::from(g)).copied()).collect();
+        let across = blur(&shown, width, photometry.blur_px);
+        let turned = transpose(&across, width);
+        let light = transpose(&blur(&turned, height, photometry.blur_px), height);
+        Self { width, height, light }
+    }
+
+    #[inline]
+    fn at(&self, column: f64, row: f64) -> f32 {
+        if column.is_nan() {
+            return 0.0;
+        }
+        let (u, v) = (column.clamp(0.0, self.width as f64 - 1.0), row.clamp(0.0, self.height as f64 - 1.0));
+        let (i, j) = (u as usize, v as usize);
+        let (a, b) = ((u - i as f64) as f32, (v - j as f64) as f32);
+        let (right, below) = ((i + 1).min(self.width - 1), (j + 1).min(self.height - 1));
+        let pixel = |i: usize, j: usize| self.light.get(j * self.width + i).copied().unwrap_or(0.0);
+        let (top, bottom) =
+            (pixel(i, j) * (1.0 - a) + pixel(right, j) * a, pixel(i, below) * (1.0 - a) + pixel(right, below) * a);
+        top * (1.0 - b) + bottom * b
+    }
+}
+
+/// Each row under a Gaussian; the border repeats its last pixel.
+fn blur(image: &[f32], width: usize, sigma_px: f64) -> Vec<f32> {
+    let reach = (4.0 * sigma_px).ceil() as usize;
+    if reach == 0 {
+        return image.to_vec();
+    }
+    let weights: Vec<f64> =
+        (0..=2 * reach).map(|i| (-0.5 * ((i as f64 - reach as f64) / sigma_px).powi(2)).exp()).collect();
+    let sum: f64 = weights.iter().sum();
+    let weights: Vec<f32> = weights.iter().map(|w| (w / sum) as f32).collect();
+    let row = |row: &[f32]| -> Vec<f32> {
+        let at = |i: usize| row.get(i.saturating_sub(reach).min(row.len() - 1)).copied().unwrap_or(0.0);
+        (0..row.len()).map(|u| weights.iter().enumerate().map(|(k, w)| w * at(u + k)).sum()).collect()
+    };
+    threads::install(|| image.par_chunks(width).flat_map_iter(row).collect())
+}
+
+fn transpose(image: &[f32], width: usize) -> Vec<f32> {
+    (0..width).flat_map(|u| image.iter().skip(u).step_by(width).copied()).collect()
 }
 
 /// Renders one shot of `bodies` from where the scanner stands.
 ///
 /// # Errors
-/// [`Error::OutOfRange`] or [`Error::NonFinite`] naming the parameter; [`Error::TooFew`] without fringes or exposures.
+/// [`Error::OutOfRange`] or [`Error::NonFinite`] naming the parameter; [`Error::TooFew`] without exposures. Without fringes
+/// there are only white images.
 pub fn simulate(
     scanner: &Scanner,
     scene_from_scanner: &Transform,
@@ -159,12 +252,11 @@ pub fn simulate(
     let edges = antialias(scanner, &view, &samples);
     let shader = Shader { scanner, fringes, exposures, photometry, samples: &samples, edges: &edges };
     let frames = if photometry.bits == 8 { Frames::Eight(shader.render()) } else { Frames::Sixteen(shader.render()) };
-    Ok(Shot { frames, samples })
+    Ok(Shot { frames, samples, edges, photometry: *photometry, projector: scanner.projector })
 }
 
 fn check(bodies: &[Body], fringes: &[FringeSet], exposures: &[f64], photometry: &Photometry) -> Result<()> {
     bodies.iter().try_for_each(Body::check)?;
-    crate::error::require_count("fringes", 1, fringes.len())?;
     crate::error::require_count("exposures", 1, exposures.len())?;
     for set in fringes {
         require_positive("fringe periods", set.periods)?;
@@ -303,7 +395,7 @@ impl<'a> View<'a> {
         {
             sample.along = weld.along(&in_body);
             if hit.part == 1 {
-                sample.deviation_mm = weld.above_reference(&in_body);
+                sample.deviation_mm = weld.step_at(&in_body);
             }
         }
         sample
@@ -444,7 +536,7 @@ impl Shader<'_> {
                 let number = e * (1 + steps) + frame;
                 exposed.iter_mut().zip(signal).for_each(|(out, s)| *out = exposure as f32 * s);
                 if let Some(out) = parts.get_mut(number) {
-                    self.develop(number, start, &exposed, out);
+                    self.photometry.develop(number as u64, start, &exposed, out);
                 }
             }
         };
@@ -478,18 +570,28 @@ impl Shader<'_> {
             }
         }
     }
+}
 
-    /// From light to numbers: black level, noise, clipping, quantisation.
-    fn develop<L: Level>(&self, frame: usize, start: usize, signal: &[f32], out: &mut [L]) {
-        let p = self.photometry;
-        let black = p.black as f32;
-        let (shot, read) = ((1.0 / p.full_well_e) as f32, ((p.read_noise_e / p.full_well_e).powi(2)) as f32);
-        let key = mix(p.seed ^ mix(frame as u64));
+impl Photometry {
+    /// From light to numbers: black level, noise, clipping, quantisation. `start` is the place of the first pixel.
+    fn develop<L: Level>(&self, frame: u64, start: usize, signal: &[f32], out: &mut [L]) {
+        let black = self.black as f32;
+        let (shot, read) = ((1.0 / self.full_well_e) as f32, (self.read_noise_e / self.full_well_e).powi(2) as f32);
+        let key = mix(self.seed ^ mix(frame));
         let normals = normals();
         for (i, (out, s)) in out.iter_mut().zip(signal).enumerate() {
             let noise = (shot * s + read).sqrt() * normals.draw(mix(key ^ (start + i) as u64));
             *out = L::of(((black + s + noise) * L::FULL).clamp(0.0, L::FULL));
         }
+    }
+
+    fn develop_all<L: Level>(&self, frame: u64, signal: &[f32]) -> Vec<L> {
+        let chunk = |start: usize, part: &[f32]| {
+            let mut out = vec![L::default(); part.len()];
+            self.develop(frame, start, part, &mut out);
+            out
+        };
+        threads::map_chunks(signal, chunk).concat()
     }
 }
 

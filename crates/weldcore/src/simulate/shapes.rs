@@ -1,7 +1,5 @@
 //! What stands in a simulated scene: analytic shapes, each in its own frame, and their first intersection with a ray.
 
-use std::f64::consts::TAU;
-
 use crate::Vec3;
 use crate::error::{Error, Result, require_positive};
 use crate::transform::Transform;
@@ -164,10 +162,9 @@ impl Body {
                 if !outside && (i + j) as i64 % 2 == 0 { albedo / 12.0 } else { albedo }
             }
             Shape::Weld(weld) if brushed > 0.0 => {
-                let (along_mm, across_mm) = weld.texture(p);
                 // Marks of a brush that went around the pipe: long along the seam, short across it.
-                let coarse = smooth_noise(along_mm / 60.0, across_mm / 4.0);
-                let fine = smooth_noise(along_mm / 17.0 + 40.0, across_mm / 0.7);
+                let place = (weld.along(p), p.z);
+                let (coarse, fine) = (weld.texture(place, 60.0, 4.0), weld.texture(place, 17.0, 0.7));
                 albedo * (1.0 + brushed * (0.7 * coarse + 0.3 * fine))
             }
             _ => albedo,
@@ -222,21 +219,16 @@ fn stem(ray: &Ray, radius: f64, length: f64, after: f64) -> Option<Hit> {
     (t > after && (0.0..=length).contains(&p.z)).then(|| Hit { t, normal: Vec3::new(p.x, p.y, 0.0) / radius, part: 0 })
 }
 
-/// Noise of -1 to 1 that is smooth over a distance of one, the same everywhere and always.
-fn smooth_noise(x: f64, y: f64) -> f64 {
+/// Noise of -1 to 1 that is smooth over a distance of one and repeats after `period` in x.
+pub(super) fn smooth_noise(x: f64, y: f64, period: f64) -> f64 {
     let (i, j) = (x.floor(), y.floor());
     let ease = |f: f64| f * f * (3.0 - 2.0 * f);
     let (u, v) = (ease(x - i), ease(y - j));
     let node = |di: f64, dj: f64| {
-        let key = ((i + di) as i64 as u64) << 32 ^ ((j + dj) as i64 as u64 & 0xffff_ffff);
+        let key = ((i + di).rem_euclid(period) as u64) << 32 ^ ((j + dj) as i64 as u64 & 0xffff_ffff);
         (super::mix(key) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
     };
     let (low, high) =
         (node(0.0, 0.0) * (1.0 - u) + node(1.0, 0.0) * u, node(0.0, 1.0) * (1.0 - u) + node(1.0, 1.0) * u);
     low * (1.0 - v) + high * v
-}
-
-/// A whole number of waves around a full turn of `radius_mm`, nearest to `wavelength_mm`, as an angular frequency.
-pub(super) fn whole_waves(radius_mm: f64, wavelength_mm: f64) -> f64 {
-    (TAU * radius_mm / wavelength_mm).round().max(1.0)
 }

@@ -6,17 +6,19 @@ use std::f64::consts::TAU;
 use crate::Vec3;
 use crate::error::{Error, Result, require_positive};
 
-use super::shapes::{Hit, Ray, entry, whole_waves};
+use super::shapes::{Hit, Ray, entry, smooth_noise};
 
 /// Parts of a weld, added to its label.
 const REFERENCE: u8 = 0;
 const OTHER: u8 = 1;
 const BEAD: u8 = 2;
 
-/// A Newton step on a surface below this, mm, ends the search: a hundredth of a nanometre.
+/// The bead is found to a hundredth of a nanometre.
 const CONVERGED_MM: f64 = 1e-8;
-/// Samples of a ray on its way through the bead's hull: a tenth of a usual bead's height apart at normal view.
-const BEAD_SAMPLES: usize = 24;
+/// A Newton step on a wall below this is the last: the error left is its square times a curvature below 1/mm.
+const LAST_STEP_MM: f64 = 1e-5;
+/// Samples of a ray on its way through the bead's hull: a quarter of a millimetre apart on a usual bead.
+const BEAD_SAMPLES: usize = 12;
 
 /// One wall: a cylinder, or a plane where the radius is infinite, whose axis may be off and askew.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -61,6 +63,11 @@ pub struct Weld {
     half_length_mm: f64,
     /// How far above the reference wall anything of the weld can stand near the seam.
     top_mm: f64,
+    /// How far a wall can stand from its cylinder or plane.
+    form_mm: f64,
+    /// Angular frequencies of the ripples and of the toes.
+    ripples: f64,
+    wander: [f64; 4],
 }
 
 /// A wall with its frame: e1, e2 across the axis, d along it; for a plate e1 is the normal.
@@ -76,15 +83,19 @@ struct Placed {
     waves: [[f64; 3]; 3],
 }
 
+/// Angular frequency of what repeats every `wavelength_mm` along the seam: a whole number of times around a pipe.
+fn frequency(radius_mm: f64, wavelength_mm: f64) -> f64 {
+    let waves = TAU * radius_mm / wavelength_mm;
+    if radius_mm.is_infinite() { TAU / wavelength_mm } else { waves.round().max(1.0) }
+}
+
 impl Placed {
     fn new(wall: Wall) -> Self {
         let flat = wall.radius_mm.is_infinite();
         let axis = Vec3::new(wall.tilt_rad[0].tan(), wall.tilt_rad[1].tan(), 1.0).normalize();
         let e1 = (Vec3::x() - axis * axis.x).normalize();
         let e2 = axis.cross(&e1);
-        let around = |wavelength: f64| {
-            if flat { TAU / wavelength } else { whole_waves(wall.radius_mm, wavelength) }
-        };
+        let around = |wavelength: f64| frequency(wall.radius_mm, wavelength);
         let waves =
             [[around(71.0), TAU / 113.0, 0.3], [-around(43.0), TAU / 61.0, 1.7], [around(97.0), TAU / 37.0, 4.1]];
         Self { wall, flat, origin: Vec3::new(wall.offset_mm[0], wall.offset_mm[1], 0.0), e1, e2, axis, waves }
@@ -93,8 +104,11 @@ impl Placed {
     /// Deviation from the cylinder or plane and its derivatives along the seam's coordinate and the axis.
     fn form(&self, along: f64, a: f64) -> [f64; 3] {
         let w = &self.wall;
-        let (sin, cos) = (2.0 * (along - w.ovality_at_rad)).sin_cos();
-        let mut form = [w.ovality_mm * cos, -2.0 * w.ovality_mm * sin, 0.0];
+        let mut form = [0.0; 3];
+        if w.ovality_mm != 0.0 {
+            let (sin, cos) = (2.0 * (along - w.ovality_at_rad)).sin_cos();
+            form = [w.ovality_mm * cos, -2.0 * w.ovality_mm * sin, 0.0];
+        }
         if w.waviness_mm > 0.0 {
             for [n, k, start] in self.waves {
                 let (sin, cos) = (n * along + k * a + start).sin_cos();
@@ -155,25 +169,25 @@ impl Placed {
         self.ideal(&back, by).map_or(f64::INFINITY, |t| -t)
     }
 
-    /// Where the ray meets the wall: the closed form, then Newton on what the form adds to it.
-    fn meet(&self, ray: &Ray) -> Option<f64> {
-        let mut t = self.ideal(ray, 0.0)?;
+    /// Where the ray meets the wall, and the gradient there: from the closed form, by Newton on what the form adds to it.
+    fn meet(&self, ray: &Ray, mut t: f64) -> Option<(f64, Vec3)> {
+        let speed = ray.direction.norm();
+        let (mut height, mut gradient) = self.height(&ray.at(t));
         if !self.plain() {
-            let speed = ray.direction.norm();
             for _ in 0..12 {
-                let (height, gradient) = self.height(&ray.at(t));
                 let slope = gradient.dot(&ray.direction);
                 if slope >= 0.0 {
                     return None;
                 }
                 let step = height / slope;
                 t -= step;
-                if step.abs() * speed < CONVERGED_MM {
-                    return Some(t);
+                if step.abs() * speed < LAST_STEP_MM {
+                    break;
                 }
+                (height, gradient) = self.height(&ray.at(t));
             }
         }
-        Some(t)
+        Some((t, gradient))
     }
 
     /// The wall without its waviness.
@@ -186,7 +200,7 @@ impl Weld {
     /// A weld of two walls. The reference wall's axis is z: it has no offset and no tilt.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] naming the parameter; [`Error::Degenerate`] for a pipe welded to a plate.
+    /// [`Error::OutOfRange`] or [`Error::NonFinite`] naming the parameter.
     pub fn new(reference: Wall, other: Wall, bead: Bead, length_mm: f64) -> Result<Self> {
         let zero = [0.0; 2];
         if reference.offset_mm != zero || reference.tilt_rad != zero {
@@ -195,7 +209,12 @@ impl Weld {
             return Err(Error::OutOfRange { what, expected: "0: the weld's frame is its own".into(), value });
         }
         if reference.radius_mm.is_infinite() != other.radius_mm.is_infinite() {
-            return Err(Error::Degenerate { what: "weld", reason: "one wall is a plate, the other a pipe".into() });
+            let value = format!("{} and {}", reference.radius_mm, other.radius_mm);
+            return Err(Error::OutOfRange {
+                what: "walls' radius_mm",
+                expected: "two pipes or two plates".into(),
+                value,
+            });
         }
         let step = if reference.radius_mm.is_infinite() { 0.0 } else { other.radius_mm - reference.radius_mm };
         let lean = bead.width_mm * (other.tilt_rad[0].abs() + other.tilt_rad[1].abs());
@@ -208,9 +227,13 @@ impl Weld {
             + other.offset_mm[0].hypot(other.offset_mm[1])
             + step.abs()
             + lean;
+        let form_mm = [reference, other].map(|w| w.ovality_mm.abs() + w.waviness_mm).into_iter().fold(0.0, f64::max);
+        let frequency = |wavelength_mm: f64| frequency(reference.radius_mm, wavelength_mm);
+        let (ripples, wander) = (frequency(bead.pitch_mm), [31.0, 11.0, 27.0, 9.0].map(frequency));
         let (reference, other) = (Placed::new(reference), Placed::new(other));
         let smooth = [reference.smooth(), other.smooth()];
-        let weld = Self { reference, other, smooth, bead, half_length_mm: 0.5 * length_mm, top_mm };
+        let weld =
+            Self { reference, other, smooth, bead, half_length_mm: 0.5 * length_mm, top_mm, form_mm, ripples, wander };
         weld.check()?;
         Ok(weld)
     }
@@ -260,15 +283,6 @@ impl Weld {
         if self.reference.flat { p.y } else { p.y.atan2(p.x) }
     }
 
-    /// Angular frequency of something that repeats every `wavelength_mm` along the seam.
-    fn frequency(&self, wavelength_mm: f64) -> f64 {
-        if self.reference.flat {
-            TAU / wavelength_mm
-        } else {
-            whole_waves(self.reference.wall.radius_mm, wavelength_mm)
-        }
-    }
-
     /// Where the toes are at this place along the seam, z, mm.
     fn toes(&self, along: f64) -> (f64, f64) {
         let Bead { width_mm, wander_mm, .. } = self.bead;
@@ -276,14 +290,15 @@ impl Weld {
         if wander_mm == 0.0 {
             return (-half, half);
         }
+        let [a, b, c, d] = self.wander;
         let wave = |slow: f64, fast: f64, start: f64| {
-            let (a, b) = (self.frequency(slow) * along + start, self.frequency(fast) * along - start);
-            (wander_mm * (0.6 * a.sin() + 0.4 * b.sin())).min(half)
+            let swing = 0.6 * (slow * along + start).sin() + 0.4 * (fast * along - start).sin();
+            (wander_mm * swing).min(half)
         };
-        (-half + wave(31.0, 11.0, 0.5), half + wave(27.0, 9.0, 2.5))
+        (-half + wave(a, b, 0.5), half + wave(c, d, 2.5))
     }
 
-    /// Height above the bead's surface; at the toes it is the height above the walls.
+    /// Height above the bead's surface; at the toes it is the height above the walls, but for their waviness.
     fn above_bead(&self, p: &Vec3) -> f64 {
         let along = self.along(p);
         let (low, high) = self.toes(along);
@@ -292,16 +307,22 @@ impl Weld {
         let cap = 4.0 * across * (1.0 - across);
         // Ripples are crescents: the pool freezes first at the toes.
         let bow = 0.35 * self.bead.width_mm / self.bead.pitch_mm * TAU * (1.0 - cap);
-        let ripple = (self.frequency(self.bead.pitch_mm) * along + bow).cos();
-        (1.0 - blend) * self.reference.height(p).0 + blend * self.other.height(p).0
+        let ripple = (self.ripples * along + bow).cos();
+        let [reference, other] = &self.smooth;
+        (1.0 - blend) * reference.height(p).0 + blend * other.height(p).0
             - cap * (self.bead.height_mm + self.bead.ripple_mm * ripple)
     }
 
-    fn bead_normal(&self, p: &Vec3) -> Vec3 {
+    /// The toes lie within this distance of the seam.
+    fn slab_mm(&self) -> f64 {
+        0.5 * self.bead.width_mm + self.bead.wander_mm
+    }
+
+    fn bead_gradient(&self, p: &Vec3) -> Vec3 {
         // Central differences: the surface has no detail as fine as that.
         let h = 1e-4;
         let slope = |e: Vec3| self.above_bead(&(p + e * h)) - self.above_bead(&(p - e * h));
-        Vec3::new(slope(Vec3::x()), slope(Vec3::y()), slope(Vec3::z())).normalize()
+        Vec3::new(slope(Vec3::x()), slope(Vec3::y()), slope(Vec3::z()))
     }
 
     fn meet_bead(&self, ray: &Ray, after: f64, until: f64) -> Option<f64> {
@@ -309,7 +330,7 @@ impl Weld {
             return None;
         }
         // The hull: a slab that holds the toes, under a surface that nothing of the bead reaches.
-        let slab = 0.5 * self.bead.width_mm + self.bead.wander_mm;
+        let slab = self.slab_mm();
         let (z, dz) = (ray.origin.z, ray.direction.z);
         let (mut start, mut end) = (after, until);
         if dz.abs() > 0.0 {
@@ -376,50 +397,48 @@ impl Weld {
 
     /// The first hit beyond `after`.
     pub(super) fn hit(&self, ray: &Ray, after: f64) -> Option<Hit> {
-        let mut best: Option<(f64, u8)> = None;
-        let mut offer = |t: f64, part: u8| {
-            if t > after && best.is_none_or(|(found, _)| t < found) {
-                best = Some((t, part));
-            }
+        let mut best: Option<(f64, Vec3, u8)> = None;
+        let slab = self.slab_mm();
+        // Walls are searched only where their closed form says that it is worth it.
+        let margin = 5.0 + 10.0 * self.form_mm;
+        let speed = ray.direction.norm();
+        let met = |wall: &Placed, side: f64| {
+            let t = wall.ideal(ray, 0.0)?;
+            let beyond = side * ray.at(t).z > slab + margin;
+            if beyond || (t - after) * speed < -margin { None } else { wall.meet(ray, t) }
         };
-        let reference = self.reference.meet(ray);
-        let other = self.other.meet(ray);
+        let (reference, other) = (met(&self.reference, 1.0), met(&self.other, -1.0));
         for (found, part) in [(reference, REFERENCE), (other, OTHER)] {
-            let Some(t) = found else { continue };
+            let Some((t, gradient)) = found else { continue };
             let p = ray.at(t);
-            if p.z.abs() > self.half_length_mm {
+            if t <= after || p.z.abs() > self.half_length_mm || best.is_some_and(|(first, ..)| first <= t) {
                 continue;
             }
-            let (low, high) =
-                self.toes(if p.z.abs() > self.bead.width_mm + self.bead.wander_mm { 0.0 } else { self.along(&p) });
+            // Far from the seam the toes need not be known.
+            let (low, high) = if p.z.abs() > slab { (-slab, slab) } else { self.toes(self.along(&p)) };
             if (part == REFERENCE && p.z < low) || (part == OTHER && p.z >= high) {
-                offer(t, part);
+                best = Some((t, gradient, part));
             }
         }
-        // A ray that misses both walls may still graze the bead.
-        // The cap stands on both walls: below the two of them there is none left.
-        let deep = reference.zip(other).map_or(f64::INFINITY, |(a, b)| a.max(b) + 1e-6);
-        if let Some(t) = self.meet_bead(ray, after, best.map_or(deep, |(t, _)| t.min(deep))) {
+        // A ray that misses both walls may still graze the bead. The cap stands on both walls: below the two of them
+        // there is none left.
+        let deep = reference.zip(other).map_or(f64::INFINITY, |((a, _), (b, _))| a.max(b) + self.form_mm / speed);
+        if let Some(t) = self.meet_bead(ray, after, best.map_or(deep, |(t, ..)| t.min(deep))) {
             let p = ray.at(t);
             let (low, high) = self.toes(self.along(&p));
             if (low..=high).contains(&p.z) {
-                best = Some((t, BEAD));
+                best = Some((t, self.bead_gradient(&p), BEAD));
             }
         }
-        let (t, part) = best?;
-        let p = ray.at(t);
-        let normal = match part {
-            REFERENCE => self.reference.height(&p).1.normalize(),
-            OTHER => self.other.height(&p).1.normalize(),
-            _ => self.bead_normal(&p),
-        };
-        Some(Hit { t, normal, part })
+        best.map(|(t, gradient, part)| Hit { t, normal: gradient.normalize(), part })
     }
 
-    /// How far a point in the weld's frame stands out from the reference wall, its waviness left out, mm.
+    /// How far the other wall stands out from the reference wall at one of its points, the waviness of both left out,
+    /// mm.
     #[inline]
-    pub fn above_reference(&self, p: &Vec3) -> f64 {
-        self.smooth[0].height(p).0
+    pub fn step_at(&self, p: &Vec3) -> f64 {
+        // The point's height over its own smooth wall is that wall's waviness.
+        self.smooth[0].height(p).0 - self.smooth[1].height(p).0
     }
 
     /// The true step at the seam: other wall minus reference wall along the radius at `along` (rad about the axis;
@@ -443,9 +462,22 @@ impl Weld {
         surface(other) - surface(reference)
     }
 
-    /// Millimetres along and across the seam, for surface texture.
-    pub(super) fn texture(&self, p: &Vec3) -> (f64, f64) {
-        let scale = if self.reference.flat { 1.0 } else { self.reference.wall.radius_mm };
-        (self.along(p) * scale, p.z)
+    /// Noise of -1 to 1 on the surface, smooth over these lengths along and across the seam.
+    pub(super) fn texture(&self, (along, across): (f64, f64), along_mm: f64, across_mm: f64) -> f64 {
+        let turns = frequency(self.reference.wall.radius_mm, along_mm) / TAU;
+        let period = if self.reference.flat { 1e9 } else { TAU * turns };
+        smooth_noise(along * turns, across / across_mm, period.round())
+    }
+
+    /// Whether a point lies in the solid: below the surface that stands at its z.
+    #[cfg(test)]
+    pub(super) fn inside(&self, p: &Vec3) -> bool {
+        let (low, high) = self.toes(self.along(p));
+        let surface = match p.z {
+            z if z < low => &self.reference,
+            z if z >= high => &self.other,
+            _ => return self.above_bead(p) <= 0.0,
+        };
+        p.z.abs() <= self.half_length_mm && surface.height(p).0 <= 0.0
     }
 }

@@ -7,8 +7,7 @@ import weldscan
 result = weldscan.inspect(sys.argv[1])
 if result.step is None:
     sys.exit(f"{result.verdict}: {result.verdicts[0].reason}")
-print(
-    f"{result.verdict}: largest step {result.step.max_abs_mm:.3f} ± {result.step.expanded_uncertainty_mm:.3f} mm (k = 2)"
-)
-for angle, step, u in zip(result.step.angle_deg, result.step.step_mm, result.step.u_mm, strict=True):
-    print(f"{angle:5.0f}°  {step:+.3f} ± {u:.3f} mm")
+step = result.step
+print(f"{result.verdict}: largest step {step.max_abs_mm:.3f} ± {step.expanded_uncertainty_mm:.3f} mm (k = 2)")
+for angle, step_mm, u_mm in zip(step.angle_deg, step.step_mm, step.u_mm, strict=True):
+    print(f"{angle:5.0f}°  {step_mm:+.3f} ± {u_mm:.3f} mm")

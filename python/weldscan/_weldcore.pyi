@@ -21,6 +21,7 @@ __all__ = [
     "WeakDirection",
     "__version__",
     "decode",
+    "decode_png",
     "find_spheres",
     "register_icp",
     "register_rigid",
@@ -32,6 +33,7 @@ __all__ = [
 
 __version__: str
 
+def decode_png(data: bytes, size: tuple[int, int] | None = None) -> NDArray[np.uint8] | NDArray[np.uint16]: ...
 def set_threads(threads: int | None = None) -> None: ...
 
 # scanner

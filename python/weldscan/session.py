@@ -13,19 +13,17 @@ import os
 import re
 import secrets
 import shutil
-import struct
-import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar, cast
+from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
-from weldscan._weldcore import Lens, Scanner
+from weldscan._weldcore import Lens, Scanner, decode_png
 from weldscan.errors import InputError
 
 Image: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
@@ -480,9 +478,6 @@ def _short(value: Any) -> str:
 
 # --- images -----------------------------------------------------------------------------------------------------------
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_COLOURS = {2: "colour", 3: "colour (a palette)", 4: "grey with transparency", 6: "colour with transparency"}
-CRITICAL = (b"IHDR", b"PLTE", b"IDAT", b"IEND")
 # Camera noise has no repetitions to look for: a Huffman code of the differences is smaller and three times as fast.
 PNG_PARAMETERS = [
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
@@ -540,7 +535,7 @@ def _read_shots(session: Session, shots: Sequence[ShotSpec]) -> list[list[list[I
         for row in frame_names(session, shot)
         for name in row
     ]
-    # Inflating takes nearly all the time, and OpenCV lets go of the interpreter meanwhile.
+    # Inflating takes nearly all the time, and lets go of the interpreter meanwhile.
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         images = iter(list(pool.map(lambda path: read_image(path, size), names)))
     stacks = [[[next(images) for _ in row] for row in frame_names(session, shot)] for shot in shots]
@@ -557,10 +552,7 @@ def _read_shots(session: Session, shots: Sequence[ShotSpec]) -> list[list[list[I
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None) -> Image:
-    """One grey PNG of 8 or 16 bits, (height, width) uint8 or uint16.
-
-    OpenCV fills what a damaged file lacks with zeros and complains on stderr; here the file's own structure is checked
-    first.
+    """One grey PNG of 8 or 16 bits, (height, width) uint8 or uint16; strictly, unlike OpenCV (docs/decisions/0002).
 
     Args:
         path: the file.
@@ -570,57 +562,13 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> Image:
         InputError: see `read_frames`.
     """
     try:
-        data = path.read_bytes()
+        return decode_png(path.read_bytes(), size)
     except FileNotFoundError:
         raise InputError(f"{path}: no such image") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    try:
-        width, height, depth, data = _checked_png(data)
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    if size is not None and (width, height) != size:
-        raise InputError(f"{path}: is {width}x{height} pixels, but the camera has {size[0]}x{size[1]}")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
-    if image is None or image.shape != (height, width) or image.dtype.itemsize * 8 != depth:
-        raise InputError(f"{path}: is a damaged PNG: its pixels cannot be decoded")
-    return cast("Image", image)
-
-
-def _checked_png(data: bytes) -> tuple[int, int, int, bytes]:
-    """Width, height, depth and the bytes to decode (critical chunks only) of a whole grey PNG; ValueError otherwise."""
-    if not data:
-        raise ValueError("is empty")
-    if not data.startswith(PNG_SIGNATURE):
-        raise ValueError("is not a PNG image")
-    chunks, at, kind = [data[:8]], 8, b""
-    while kind != b"IEND":
-        if at + 12 > len(data):
-            raise ValueError(f"is truncated: the PNG breaks off after {len(data)} bytes")
-        length, kind = struct.unpack_from(">I4s", data, at)
-        end = at + 12 + length
-        if end > len(data):
-            raise ValueError(f"is truncated: the PNG breaks off after {len(data)} bytes")
-        if zlib.crc32(memoryview(data)[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end]):
-            raise ValueError(f"is a damaged PNG: the check sum at byte {end - 4} does not fit")
-        if at == 8 and (kind != b"IHDR" or length != 13):
-            raise ValueError("is a damaged PNG: it does not begin with its header")
-        if kind in CRITICAL:
-            chunks.append(data[at:end])
-        at = end
-    width, height, depth, colour = struct.unpack_from(">IIBB", data, 16)
-    if colour != 0:
-        raise ValueError(f"is {PNG_COLOURS.get(colour, 'of an unknown kind')}, but should be grey (one channel)")
-    if depth not in (8, 16):
-        raise ValueError(f"is of {depth} bits, but should be of 8 or 16")
-    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
-        raise ValueError(f"is {width}x{height} pixels")
-    # Colour profiles and the like make the decoder talk; the pixels need none of them.
-    whole = sum(map(len, chunks)) == len(data)
-    return width, height, depth, data if whole else b"".join(chunks)
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------

@@ -50,6 +50,12 @@ pub enum Error {
         /// Why it cannot be.
         reason: String,
     },
+    /// An image file is not what it should be.
+    #[error("{reason}")]
+    Image {
+        /// What it is, and what it should be; the file's name goes before it.
+        reason: String,
+    },
     /// What was looked for is not in the data.
     #[error("{what} not found: {reason}")]
     NotFound {

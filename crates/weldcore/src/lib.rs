@@ -27,12 +27,14 @@
 //! | [`mesh`] | triangle meshes |
 //! | [`segment`] | reference wall, other wall and bead |
 //! | [`step`] | the step around the seam and its uncertainty |
+//! | [`image`] | grey PNG files, read strictly |
 //! | [`simulate`] | ray-cast fringe images of analytic scenes |
 
 pub mod distance;
 pub mod error;
 pub mod fit;
 pub mod icp;
+pub mod image;
 pub mod kdtree;
 pub mod mesh;
 pub mod normals;

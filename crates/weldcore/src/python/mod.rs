@@ -10,6 +10,7 @@ use pyo3::types::PyDict;
 mod distance;
 mod fit;
 mod icp;
+mod image;
 mod kdtree;
 mod phase;
 mod scanner;
@@ -23,7 +24,7 @@ use crate::transform::Transform;
 /// Turns a core error into the exception of the same kind from `weldscan.errors`.
 pub(crate) fn raise(py: Python<'_>, error: &Error) -> PyErr {
     let class = match error {
-        Error::Shape { .. } | Error::NonFinite { .. } | Error::OutOfRange { .. } => "InputError",
+        Error::Shape { .. } | Error::NonFinite { .. } | Error::OutOfRange { .. } | Error::Image { .. } => "InputError",
         Error::TooFew { .. } | Error::Degenerate { .. } | Error::NotFound { .. } => "GeometryError",
     };
     raise_as(py, class, error.to_string())
@@ -123,6 +124,7 @@ fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
     transform::register(m)?;
     distance::register(m)?;
     icp::register(m)?;
+    image::register(m)?;
     simulate::register(m)?;
     Ok(())
 }

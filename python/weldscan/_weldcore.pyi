@@ -8,26 +8,33 @@ from numpy.typing import ArrayLike, NDArray
 __all__ = [
     "Cloud",
     "Cylinder",
+    "CylinderFit",
     "FoundSphere",
     "KdTree",
     "Lens",
     "PhaseMap",
     "Plane",
+    "PlaneFit",
     "Registration",
     "RigidFit",
     "Scanner",
     "SimulatedShot",
     "Sphere",
+    "SphereFit",
     "WeakDirection",
     "__version__",
     "decode",
     "decode_png",
     "find_spheres",
+    "fit_cylinder",
+    "fit_plane",
+    "fit_sphere",
     "register_icp",
     "register_rigid",
     "set_threads",
     "simulate_shot",
     "simulated_step",
+    "sphere_through_points",
     "triangulate",
 ]
 
@@ -167,6 +174,81 @@ def simulate_shot(
 def simulated_step(weld: Any, along: ArrayLike) -> NDArray[np.float64]: ...
 
 # fit
+@final
+class PlaneFit:
+    @property
+    def point_mm(self) -> NDArray[np.float64]: ...
+    @property
+    def normal(self) -> NDArray[np.float64]: ...
+    @property
+    def rms_mm(self) -> float: ...
+    @property
+    def covariance(self) -> NDArray[np.float64]: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def inliers(self) -> NDArray[np.int64] | None: ...
+
+@final
+class SphereFit:
+    @property
+    def center_mm(self) -> NDArray[np.float64]: ...
+    @property
+    def radius_mm(self) -> float: ...
+    @property
+    def rms_mm(self) -> float: ...
+    @property
+    def covariance(self) -> NDArray[np.float64]: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def inliers(self) -> NDArray[np.int64] | None: ...
+
+@final
+class CylinderFit:
+    @property
+    def point_mm(self) -> NDArray[np.float64]: ...
+    @property
+    def axis(self) -> NDArray[np.float64]: ...
+    @property
+    def radius_mm(self) -> float: ...
+    @property
+    def rms_mm(self) -> float: ...
+    @property
+    def covariance(self) -> NDArray[np.float64]: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def inliers(self) -> NDArray[np.int64] | None: ...
+
+def fit_plane(
+    points: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    sigma_mm: float | None = None,
+    robust: bool = False,
+    seed: int = 0,
+) -> PlaneFit: ...
+def fit_sphere(
+    points: ArrayLike,
+    radius_mm: float | None = None,
+    *,
+    weights: ArrayLike | None = None,
+    sigma_mm: float | None = None,
+    robust: bool = False,
+    seed: int = 0,
+) -> SphereFit: ...
+def fit_cylinder(
+    points: ArrayLike,
+    radius_mm: float | None = None,
+    *,
+    weights: ArrayLike | None = None,
+    sigma_mm: float | None = None,
+    robust: bool = False,
+    seed: int = 0,
+) -> CylinderFit: ...
+def sphere_through_points(points: ArrayLike) -> tuple[NDArray[np.float64], float]: ...
+
 @final
 class FoundSphere:
     @property

@@ -78,6 +78,11 @@ pub fn map_chunks<T: Sync, R: Send>(items: &[T], job: impl Fn(usize, &[T]) -> R 
     install(|| items.par_chunks(CHUNK).enumerate().map(|(i, chunk)| job(i * CHUNK, chunk)).collect())
 }
 
+/// Maps `job` over items that are worth a thread each; the results come in the order of the items.
+pub fn map_each<T: Sync, R: Send>(items: &[T], job: impl Fn(&T) -> R + Sync) -> Vec<R> {
+    install(|| items.par_iter().map(&job).collect())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

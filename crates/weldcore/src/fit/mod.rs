@@ -16,8 +16,8 @@ use crate::Vec3;
 use crate::error::{Error, Result, require_finite};
 use crate::threads;
 
-/// A fitted surface and how well the points support it. `S` is a plane, [`sphere::Sphere`] or
-/// a cylinder.
+/// A fitted surface and how well the points support it. `S` is [`plane::Plane`], [`sphere::Sphere`] or
+/// [`cylinder::Cylinder`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fit<S> {
     /// The surface.
@@ -117,6 +117,11 @@ impl Local {
     fn to_world(self, q: &Vec3) -> Vec3 {
         self.origin + q * self.scale
     }
+}
+
+/// What is left of the data's digits, in local units: a spread below this is rounding.
+fn rounding(local: Local) -> f64 {
+    4.0 * f64::EPSILON * (1.0 + local.origin.amax() / local.scale)
 }
 
 /// The weighted sums of one Gauss-Newton step in `P` unknowns.
@@ -236,6 +241,9 @@ impl<const P: usize> Normal<P> {
 /// More steps than any solvable fit has been seen to take.
 const MAX_STEPS: usize = 300;
 
+/// Steps below this, in parts of the data's extent, are not judged by the cost any more.
+const NEAR: f64 = 1e-9;
+
 /// Levenberg-Marquardt from `start` until the step is lost in rounding. Returns the surface, its sums, the steps taken.
 fn minimise<const P: usize, M: Model<P>>(
     what: &'static str,
@@ -260,25 +268,24 @@ fn minimise<const P: usize, M: Model<P>>(
             damping = (damping * 10.0).max(1e-9);
             continue;
         };
+        // The step as the distances see it, in local units.
+        let size = (step.dot(&(normal.matrix * step)).max(0.0) / normal.weight).sqrt();
         let moved = model.moved(&step);
         let next = Normal::of(&moved, points, local, noise);
-        // The cost itself carries rounding: at the minimum two equal surfaces differ by this much.
-        let slack = 64.0 * f64::EPSILON * (normal.cost + f64::EPSILON * normal.weight);
-        if next.cost.is_finite() && next.cost <= normal.cost + slack {
-            // Size of the step as the distances see it.
-            let size = (step.dot(&(normal.matrix * step)).max(0.0) / normal.weight).sqrt();
-            (model, normal) = (moved, next);
-            let undamped = damping < 1e-6;
-            damping = if damping < 1e-8 { 0.0 } else { damping / 10.0 };
-            // Either rounding alone moves the surface, or the steps have stopped shrinking near it.
-            if undamped && (size == 0.0 || (size < 1e-11 && size >= 0.5 * last)) {
-                return if normal.step(0.0).is_some() {
-                    Ok((model, normal, iteration))
-                } else {
-                    fail("the points do not determine it")
-                };
+        if damping == 0.0 && size < NEAR {
+            // The cost is level to its rounding here; the gradient still has digits, until the steps stop shrinking.
+            if !next.cost.is_finite() || size > 0.5 * last {
+                return Ok((model, normal, iteration));
             }
-            last = size;
+            (model, normal, last) = (moved, next, size);
+            continue;
+        }
+        last = f64::INFINITY;
+        // Each distance is rounded by about an epsilon of the data's extent, 1; so much is the cost in doubt.
+        let doubt = f64::EPSILON * (normal.cost + (normal.cost * normal.weight).sqrt() + f64::EPSILON * normal.weight);
+        if next.cost.is_finite() && next.cost <= normal.cost + 4.0 * doubt {
+            (model, normal) = (moved, next);
+            damping = if damping < 1e-8 || size < NEAR { 0.0 } else { damping / 10.0 };
         } else {
             damping = (damping * 10.0).max(1e-6);
             if damping > 1e12 {
@@ -290,8 +297,7 @@ fn minimise<const P: usize, M: Model<P>>(
             }
         }
     }
-    // A slow but bounded crawl is still a minimum to within the last step; a runaway is not.
-    if last < 1e-9 { Ok((model, normal, MAX_STEPS)) } else { fail("the fit does not converge: too flat for its noise") }
+    fail("the fit does not converge: too flat for its noise")
 }
 
 /// Weighted mean and covariance of points, and the principal axes, least variance first.

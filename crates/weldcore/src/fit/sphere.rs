@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, Matrix4, SVector, Vector4};
 
-use super::{Fit, Local, Model, Moments, Noise, Normal, minimise};
+use super::{Fit, Local, Model, Moments, Noise, Normal, minimise, rounding};
 use crate::Vec3;
 use crate::error::{Error, Result, require_finite, require_positive};
 
@@ -15,6 +15,13 @@ pub struct Sphere {
     pub center_mm: Vec3,
     /// Radius, mm.
     pub radius_mm: f64,
+}
+
+impl Sphere {
+    /// Signed distance of a point from the surface, positive outside, mm.
+    pub fn distance(&self, p: &[f64; 3]) -> f64 {
+        (Vec3::from(*p) - self.center_mm).norm() - self.radius_mm
+    }
 }
 
 /// Centre and radius unknown (P = 4), or the centre alone (P = 3).
@@ -125,11 +132,11 @@ fn fit_in(
 /// best plane, whichever leaves the least squares.
 fn start(points: &[[f64; 3]], radius: Option<f64>, local: Local, noise: &Noise) -> Result<Unknown> {
     let moments = Moments::of(points, local, noise);
-    // Collinear: any sphere through the line's points turns about it.
-    if moments.variances[1] <= 1e-24 * moments.variances[2] {
+    // Any sphere through the points of a line turns about it.
+    if moments.variances[1] <= rounding(local).powi(2) {
         return Err(Error::Degenerate { what: WHAT, reason: "the points lie on a line".into() });
     }
-    let flat = moments.variances[0] <= 1e-28 * moments.variances[2];
+    let flat = moments.variances[0] <= rounding(local).powi(2);
     let mut candidates = Vec::new();
     if !flat {
         let linear = Linear { axes: moments.axes, mean: moments.mean };

@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, Matrix3, SMatrix, SVector};
 
 use super::plane::{complete, tilted, upright};
-use super::{Fit, Local, Model, Moments, Noise, Normal, minimise, rounding};
+use super::{Fit, Local, Model, Moments, Noise, Normal, Number, minimise};
 use crate::Vec3;
 use crate::error::{Error, Result, require_positive};
 use crate::threads;
@@ -52,14 +52,14 @@ impl Unknown {
     }
 
     /// Derivatives by the shifts and the tilts, and the distance.
-    #[inline]
-    fn across(&self, q: &[f64; 3]) -> ([f64; 4], f64) {
-        let d = [q[0] - self.point[0], q[1] - self.point[1], q[2] - self.point[2]];
-        let [x, y, t] = self.axes.map(|a| a[0] * d[0] + a[1] * d[1] + a[2] * d[2]);
+    #[inline(always)]
+    fn across<T: Number>(&self, q: &[T; 3]) -> ([T; 4], T) {
+        let d: [T; 3] = std::array::from_fn(|k| q[k] - T::of(self.point[k]));
+        let [x, y, t] = self.axes.map(|a| T::of(a[0]) * d[0] + T::of(a[1]) * d[1] + T::of(a[2]) * d[2]);
         let r = (x * x + y * y).sqrt();
-        // A point on the axis has no direction; it pulls nowhere.
-        let s = if r > 0.0 { -1.0 / r } else { 0.0 };
-        ([x * s, y * s, x * s * t, y * s * t], r - self.radius)
+        let s = r.pull();
+        let (x, y) = (x * s, y * s);
+        ([x, y, x * t, y * t], r - T::of(self.radius))
     }
 
     fn shifted(&self, step: &[f64]) -> Self {
@@ -72,10 +72,10 @@ impl Unknown {
 }
 
 impl Model<5> for Unknown {
-    #[inline]
-    fn row(&self, q: &[f64; 3]) -> ([f64; 5], f64) {
+    #[inline(always)]
+    fn row<T: Number>(&self, q: &[T; 3]) -> ([T; 5], T) {
         let (j, d) = self.across(q);
-        ([j[0], j[1], j[2], j[3], -1.0], d)
+        ([j[0], j[1], j[2], j[3], T::of(-1.0)], d)
     }
 
     fn moved(&self, step: &SVector<f64, 5>) -> Self {
@@ -84,8 +84,8 @@ impl Model<5> for Unknown {
 }
 
 impl Model<4> for Unknown {
-    #[inline]
-    fn row(&self, q: &[f64; 3]) -> ([f64; 4], f64) {
+    #[inline(always)]
+    fn row<T: Number>(&self, q: &[T; 3]) -> ([T; 4], T) {
         self.across(q)
     }
 
@@ -109,10 +109,10 @@ pub fn fit(points: &[[f64; 3]], radius_mm: Option<f64>, noise: Noise) -> Result<
     }
     let local = Local::of(WHAT, points, &noise)?;
     let moments = Moments::of(points, local, &noise);
-    if moments.variances[1] <= rounding(local).powi(2) {
+    if moments.collinear {
         return Err(Error::Degenerate { what: WHAT, reason: "the points lie on a line".into() });
     }
-    if moments.variances[0] <= rounding(local).powi(2) {
+    if moments.coplanar {
         return Err(Error::Degenerate { what: WHAT, reason: "the points lie in a plane".into() });
     }
     let radius = radius_mm.map(|r| r / local.scale);
@@ -235,7 +235,7 @@ fn starts(points: &[[f64; 3]], radius: Option<f64>, local: Local, noise: &Noise,
             kept.push(candidate);
         }
     }
-    let unit = Local { origin: Vec3::zeros(), scale: 1.0 };
+    let unit = Local::new(Vec3::zeros(), 1.0);
     let refined = threads::map_each(&kept, |start| {
         let all = Noise::default();
         if radius.is_some() {
@@ -291,9 +291,6 @@ pub(super) fn through(points: &[[f64; 3]; 3], axis: &Vec3, radius: Option<f64>) 
         (x, y, r) = (bx / 2.0 - side * height * by, by / 2.0 + side * height * bx, known);
     }
     let point = axes.transpose() * Vec3::new(a.0 + x, a.1 + y, 0.0);
-    (r > 0.0 && point.iter().chain([&r]).all(|v| v.is_finite())).then(|| Cylinder {
-        point_mm: point,
-        axis: *axis,
-        radius_mm: r,
-    })
+    let there = r > 0.0 && point.iter().chain([&r]).all(|v| v.is_finite());
+    there.then_some(Cylinder { point_mm: point, axis: *axis, radius_mm: r })
 }

@@ -10,6 +10,8 @@ pub mod robust;
 pub mod sphere;
 pub mod spheres;
 
+use std::ops::{Add, Mul, Sub};
+
 use nalgebra::{DMatrix, SMatrix, SVector};
 
 use crate::Vec3;
@@ -73,9 +75,15 @@ impl Noise<'_> {
 struct Local {
     origin: Vec3,
     scale: f64,
+    /// `1 / scale`, exact too.
+    inverse: f64,
 }
 
 impl Local {
+    fn new(origin: Vec3, scale: f64) -> Self {
+        Self { origin, scale, inverse: 1.0 / scale }
+    }
+
     /// Centred on the weighted mean, extents about 1. Refuses points that are all equal.
     fn of(what: &'static str, points: &[[f64; 3]], noise: &Noise) -> Result<Self> {
         let first = points.first().copied().unwrap_or_default();
@@ -106,22 +114,17 @@ impl Local {
         if extent <= 4.0 * f64::EPSILON * size || extent < f64::MIN_POSITIVE.sqrt() {
             return Err(Error::Degenerate { what, reason: "all points are equal".into() });
         }
-        Ok(Self { origin: origin.into(), scale: extent.log2().round().exp2() })
+        Ok(Self::new(origin.into(), extent.log2().round().exp2()))
     }
 
-    #[inline]
+    #[inline(always)]
     fn to_local(self, p: &[f64; 3]) -> [f64; 3] {
-        std::array::from_fn(|k| (p[k] - self.origin[k]) / self.scale)
+        std::array::from_fn(|k| (p[k] - self.origin[k]) * self.inverse)
     }
 
     fn to_world(self, q: &Vec3) -> Vec3 {
         self.origin + q * self.scale
     }
-}
-
-/// What is left of the data's digits, in local units: a spread below this is rounding.
-fn rounding(local: Local) -> f64 {
-    4.0 * f64::EPSILON * (1.0 + local.origin.amax() / local.scale)
 }
 
 /// The weighted sums of one Gauss-Newton step in `P` unknowns.
@@ -134,94 +137,266 @@ struct Normal<const P: usize> {
     cost: f64,
     /// `Σ w`.
     weight: f64,
+    /// Where the points are few: an upper triangle R with `RᵀR = matrix`, and z with `Rᵀz = -gradient`, both computed
+    /// without squaring, so that no digits are lost to a poor condition.
+    root: Option<(SMatrix<f64, P, P>, SVector<f64, P>)>,
 }
 
 /// A surface in the making: how a step in its `P` unknowns changes it and its distance to a point.
 trait Model<const P: usize>: Clone + Sync {
     /// Derivative of the distance of the point `q` by the unknowns, and the distance.
-    fn row(&self, q: &[f64; 3]) -> ([f64; P], f64);
+    fn row<T: Number>(&self, q: &[T; 3]) -> ([T; P], T);
     /// The surface after a step.
     fn moved(&self, step: &SVector<f64, P>) -> Self;
 }
 
+/// A number, or eight of them that go through the processor's lanes together.
+trait Number: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> {
+    fn of(value: f64) -> Self;
+    fn sqrt(self) -> Self;
+    /// `-1 / self`, and 0 for 0: a point in the centre has no direction and pulls nowhere.
+    fn pull(self) -> Self;
+}
+
+impl Number for f64 {
+    #[inline(always)]
+    fn of(value: f64) -> Self {
+        value
+    }
+
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        self.sqrt()
+    }
+
+    #[inline(always)]
+    fn pull(self) -> Self {
+        if self > 0.0 { -1.0 / self } else { 0.0 }
+    }
+}
+
+const LANES: usize = 8;
+
+#[derive(Clone, Copy)]
+struct Lanes([f64; LANES]);
+
+macro_rules! lanewise {
+    ($($operation:ident $name:ident $symbol:tt),*) => {$(
+        impl $operation for Lanes {
+            type Output = Self;
+
+            #[inline(always)]
+            fn $name(mut self, other: Self) -> Self {
+                for l in 0..LANES {
+                    self.0[l] $symbol other.0[l];
+                }
+                self
+            }
+        }
+    )*};
+}
+
+lanewise!(Add add +=, Sub sub -=, Mul mul *=);
+
+impl Number for Lanes {
+    #[inline(always)]
+    fn of(value: f64) -> Self {
+        Self([value; LANES])
+    }
+
+    #[inline(always)]
+    fn sqrt(mut self) -> Self {
+        for l in 0..LANES {
+            self.0[l] = self.0[l].sqrt();
+        }
+        self
+    }
+
+    #[inline(always)]
+    fn pull(mut self) -> Self {
+        for l in 0..LANES {
+            self.0[l] = self.0[l].pull();
+        }
+        self
+    }
+}
+
+/// Up to so many points the step is solved without forming squares, which costs more and loses nothing.
+const FEW: usize = 2000;
+
+/// A loop over at most five unknowns, written out: the compiler would rather vectorise it than what is inside.
+macro_rules! unrolled {
+    ($name:ident below $end:ident => $body:block) => {
+        unrolled!(@ $name, $end, $body, 0, 1, 2, 3, 4)
+    };
+    (@ $name:ident, $end:ident, $body:block, $($value:literal),*) => {
+        $({
+            let $name = $value;
+            if $name < $end $body
+        })*
+    };
+}
+
+/// The sums over a chunk: lanes are added up separately and at the end in order, whatever the width of the processor's
+/// registers, so that the bits are the same on all of them.
+#[multiversion::multiversion(targets("x86_64+avx512f", "x86_64+avx2"))]
+fn accumulate<const P: usize, M: Model<P>>(
+    model: &M,
+    points: &[[f64; 3]],
+    weights: Option<&[f64]>,
+    local: Local,
+) -> Normal<P> {
+    let zero = Lanes([0.0; LANES]);
+    let (mut matrix, mut gradient) = ([[zero; P]; P], [zero; P]);
+    let (mut cost, mut weight) = (zero, zero);
+    for (number, block) in points.chunks(LANES).enumerate() {
+        // The last block is filled up with copies of weight 0.
+        let fill = block.first().copied().unwrap_or_default();
+        let mut q = [Lanes([0.0; LANES]); 3];
+        for l in 0..LANES {
+            let local = local.to_local(block.get(l).unwrap_or(&fill));
+            (q[0].0[l], q[1].0[l], q[2].0[l]) = (local[0], local[1], local[2]);
+        }
+        let mut w = Lanes([0.0; LANES]);
+        match weights {
+            None => w.0.iter_mut().take(block.len()).for_each(|w| *w = 1.0),
+            Some(all) => w.0.iter_mut().zip(all.iter().skip(number * LANES)).for_each(|(w, given)| *w = *given),
+        }
+        let (j, d) = model.row(&q);
+        unrolled!(a below P => {
+            let wj = w * j[a];
+            gradient[a] = gradient[a] + wj * d;
+            unrolled!(b below P => {
+                if b >= a {
+                    matrix[a][b] = matrix[a][b] + wj * j[b];
+                }
+            });
+        });
+        cost = cost + w * d * d;
+        weight = weight + w;
+    }
+    let sum = |lanes: &Lanes| lanes.0.iter().sum::<f64>();
+    Normal {
+        matrix: SMatrix::from_fn(|a, b| sum(&matrix[a.min(b)][a.max(b)])),
+        gradient: SVector::from_fn(|a, _| sum(&gradient[a])),
+        cost: sum(&cost),
+        weight: sum(&weight),
+        root: None,
+    }
+}
+
+/// Triangular root of the normal matrix by Givens rotations of the rows themselves, and the right side with it.
+fn triangle<const P: usize, M: Model<P>>(
+    model: &M,
+    points: &[[f64; 3]],
+    local: Local,
+    noise: &Noise,
+) -> (SMatrix<f64, P, P>, SVector<f64, P>) {
+    let (mut root, mut right) = (SMatrix::<f64, P, P>::zeros(), SVector::<f64, P>::zeros());
+    for (i, p) in points.iter().enumerate() {
+        let w = noise.weight(i).sqrt();
+        let (row, distance) = model.row(&local.to_local(p));
+        let (mut row, mut rest) = (row.map(|v| w * v), -w * distance);
+        for a in 0..P {
+            let length = root[(a, a)].hypot(row[a]);
+            if length == 0.0 {
+                continue;
+            }
+            let (c, s) = (root[(a, a)] / length, row[a] / length);
+            for b in a..P {
+                (root[(a, b)], row[b]) = (c * root[(a, b)] + s * row[b], c * row[b] - s * root[(a, b)]);
+            }
+            (right[a], rest) = (c * right[a] + s * rest, c * rest - s * right[a]);
+        }
+    }
+    (root, right)
+}
+
 impl<const P: usize> Normal<P> {
     fn of<M: Model<P>>(model: &M, points: &[[f64; 3]], local: Local, noise: &Noise) -> Self {
-        let parts = threads::map_chunks(points, |start, chunk| {
-            let (mut matrix, mut gradient) = ([[0.0; P]; P], [0.0; P]);
-            let (mut cost, mut weight) = (0.0, 0.0);
-            for (i, p) in chunk.iter().enumerate() {
-                let w = noise.weight(start + i);
-                let (j, d) = model.row(&local.to_local(p));
-                for a in 0..P {
-                    let wj = w * j[a];
-                    gradient[a] += wj * d;
-                    for b in a..P {
-                        matrix[a][b] += wj * j[b];
-                    }
-                }
-                cost += w * d * d;
-                weight += w;
-            }
-            (matrix, gradient, cost, weight)
-        });
-        let mut sum = Self { matrix: SMatrix::zeros(), gradient: SVector::zeros(), cost: 0.0, weight: 0.0 };
-        for (matrix, gradient, cost, weight) in parts {
-            sum.matrix += SMatrix::from_fn(|a, b| matrix[a.min(b)][a.max(b)]);
-            sum.gradient += SVector::from(gradient);
-            sum.cost += cost;
-            sum.weight += weight;
+        let chunk = |start: usize, chunk: &[[f64; 3]]| {
+            accumulate(model, chunk, noise.weights.and_then(|w| w.get(start..start + chunk.len())), local)
+        };
+        // Few points are not worth a thread.
+        if points.len() <= FEW {
+            let mut sum = chunk(0, points);
+            sum.root = Some(triangle(model, points, local, noise));
+            return sum;
+        }
+        let mut sum = Self { matrix: SMatrix::zeros(), gradient: SVector::zeros(), cost: 0.0, weight: 0.0, root: None };
+        for part in threads::map_chunks(points, chunk) {
+            sum.matrix += part.matrix;
+            sum.gradient += part.gradient;
+            sum.cost += part.cost;
+            sum.weight += part.weight;
         }
         sum
     }
 
-    /// `-(N + damping·diag N)⁻¹ g` by Cholesky with the diagonal scaled to 1; `None` where N is not positive.
+    /// The undamped step from the triangular root; `None` where a column depends on the others.
+    fn exact_step(root: &SMatrix<f64, P, P>, right: &SVector<f64, P>) -> Option<SVector<f64, P>> {
+        let mut x = *right;
+        for a in (0..P).rev() {
+            let length = (0..=a).map(|k| root[(k, a)].powi(2)).sum::<f64>().sqrt();
+            let diagonal = root[(a, a)];
+            if diagonal.is_nan() || diagonal.abs() <= 64.0 * f64::EPSILON * length {
+                return None;
+            }
+            let sum: f64 = (a + 1..P).map(|k| root[(a, k)] * x[k]).sum();
+            x[a] = (x[a] - sum) / diagonal;
+        }
+        Some(x)
+    }
+
+    /// `-(N + damping·diag N)⁻¹ g` by Cholesky with the diagonal scaled to 1, or from the root; `None` where N is not positive.
     fn step(&self, damping: f64) -> Option<SVector<f64, P>> {
+        if let (Some((root, right)), true) = (&self.root, damping == 0.0) {
+            return Self::exact_step(root, right);
+        }
+        let root = self.cholesky(damping)?;
+        // RᵀR x = -g.
+        let mut x = -self.gradient;
+        for a in 0..P {
+            let sum: f64 = (0..a).map(|k| root[(k, a)] * x[k]).sum();
+            x[a] = (x[a] - sum) / root[(a, a)];
+        }
+        Self::exact_step(&root, &x)
+    }
+
+    /// The upper triangle R with `RᵀR = N + damping·diag N`; `None` where N is not positive beyond rounding.
+    fn cholesky(&self, damping: f64) -> Option<SMatrix<f64, P, P>> {
         let d = SVector::<f64, P>::from_fn(|a, _| self.matrix[(a, a)].sqrt());
         if d.iter().any(|v| !(v.is_finite() && *v > 0.0)) {
             return None;
         }
-        let mut l = SMatrix::<f64, P, P>::from_fn(|a, b| self.matrix[(a, b)] / (d[a] * d[b]));
+        let mut root = SMatrix::<f64, P, P>::zeros();
         for a in 0..P {
-            l[(a, a)] += damping;
-        }
-        for a in 0..P {
-            for b in 0..=a {
-                let sum: f64 = (0..b).map(|k| l[(a, k)] * l[(b, k)]).sum();
-                let rest = l[(a, b)] - sum;
-                if a == b {
-                    if rest <= 16.0 * f64::EPSILON {
-                        return None;
-                    }
-                    l[(a, a)] = rest.sqrt();
-                } else {
-                    l[(a, b)] = rest / l[(b, b)];
+            for b in a..P {
+                let sum: f64 = (0..a).map(|k| root[(k, a)] * root[(k, b)]).sum();
+                let full = self.matrix[(a, b)] / (d[a] * d[b]) + if a == b { damping } else { 0.0 };
+                let rest = full - sum;
+                if a == b && rest <= 16.0 * f64::EPSILON {
+                    return None;
                 }
+                root[(a, b)] = if a == b { rest.sqrt() } else { rest / root[(a, a)] };
             }
         }
-        let mut x = SVector::<f64, P>::from_fn(|a, _| -self.gradient[a] / d[a]);
-        for a in 0..P {
-            let sum: f64 = (0..a).map(|k| l[(a, k)] * x[k]).sum();
-            x[a] = (x[a] - sum) / l[(a, a)];
-        }
-        for a in (0..P).rev() {
-            let sum: f64 = (a + 1..P).map(|k| l[(k, a)] * x[k]).sum();
-            x[a] = (x[a] - sum) / l[(a, a)];
-        }
-        Some(SVector::from_fn(|a, _| x[a] / d[a]))
+        Some(SMatrix::from_fn(|a, b| root[(a, b)] * d[b]))
     }
 
     /// `N⁻¹`; NaN where it does not exist.
     fn inverse(&self) -> SMatrix<f64, P, P> {
-        let mut inverse = SMatrix::<f64, P, P>::from_element(f64::NAN);
-        let mut unit = Self { matrix: self.matrix, gradient: SVector::zeros(), cost: 0.0, weight: 0.0 };
+        let none = SMatrix::from_element(f64::NAN);
+        let Some(root) = self.root.map(|r| r.0).or_else(|| self.cholesky(0.0)) else { return none };
+        // The inverse of the triangle column by column; N⁻¹ is its square.
+        let mut inverse = SMatrix::<f64, P, P>::zeros();
         for a in 0..P {
-            unit.gradient = SVector::from_fn(|b, _| if a == b { -1.0 } else { 0.0 });
-            match unit.step(0.0) {
+            match Self::exact_step(&root, &SVector::from_fn(|b, _| if a == b { 1.0 } else { 0.0 })) {
                 Some(column) => inverse.set_column(a, &column),
-                None => return SMatrix::from_element(f64::NAN),
+                None => return none,
             }
         }
-        (inverse + inverse.transpose()) / 2.0
+        inverse * inverse.transpose()
     }
 
     /// Variance of a point of weight 1, in local units: given, or from the residuals of `counted` points.
@@ -274,7 +449,7 @@ fn minimise<const P: usize, M: Model<P>>(
         let next = Normal::of(&moved, points, local, noise);
         if damping == 0.0 && size < NEAR {
             // The cost is level to its rounding here; the gradient still has digits, until the steps stop shrinking.
-            if !next.cost.is_finite() || size > 0.5 * last {
+            if !next.cost.is_finite() || size == 0.0 || size > 0.5 * last {
                 return Ok((model, normal, iteration));
             }
             (model, normal, last) = (moved, next, size);
@@ -307,6 +482,8 @@ struct Moments {
     variances: Vec3,
     /// Unit axes as columns, in the order of the variances.
     axes: nalgebra::Matrix3<f64>,
+    collinear: bool,
+    coplanar: bool,
 }
 
 impl Moments {
@@ -324,7 +501,10 @@ impl Moments {
         let mean = Vec3::new(s[1], s[2], s[3]) / s[0];
         let second = nalgebra::Matrix3::new(s[4], s[5], s[6], s[5], s[7], s[8], s[6], s[8], s[9]) / s[0];
         let (variances, axes) = principal(&(second - mean * mean.transpose()));
-        Self { mean, variances, axes }
+        // Below this a spread is rounding: of the coordinates, or of the largest variance.
+        let digits = 4.0 * f64::EPSILON * (1.0 + local.origin.amax() * local.inverse);
+        let rounding = digits * digits + 16.0 * f64::EPSILON * variances[2];
+        Self { mean, variances, axes, collinear: variances[1] <= rounding, coplanar: variances[0] <= rounding }
     }
 }
 
@@ -336,4 +516,113 @@ fn principal(matrix: &nalgebra::Matrix3<f64>) -> (Vec3, nalgebra::Matrix3<f64>) 
     let values = Vec3::from_fn(|i, _| eigen.eigenvalues[order[i]]);
     let [a, b] = [0, 1].map(|i| Vec3::from(eigen.eigenvectors.column(order[i])));
     (values, nalgebra::Matrix3::from_columns(&[a, b, a.cross(&b)]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::sphere::Sphere;
+    use super::*;
+    use proptest::prelude::*;
+
+    /// A cap of a sphere, with a wave of the given size on it.
+    fn cap(n: usize, center: [f64; 3], radius: f64, half_angle: f64, wave: f64) -> Vec<[f64; 3]> {
+        let golden = std::f64::consts::PI * (3.0 - 5.0_f64.sqrt());
+        let point = |i: usize| {
+            let z = 1.0 - (1.0 - half_angle.cos()) * (i as f64 + 0.5) / n as f64;
+            let (s, a) = ((1.0 - z * z).sqrt(), golden * i as f64);
+            let r = radius + wave * (2.7 * i as f64).sin();
+            [center[0] + r * s * a.cos(), center[1] + r * s * a.sin(), center[2] + r * z]
+        };
+        (0..n).map(point).collect()
+    }
+
+    /// Sum of squared distances, plainly.
+    fn cost(points: &[[f64; 3]], sphere: &Sphere) -> f64 {
+        points.iter().map(|p| sphere.distance(p).powi(2)).sum()
+    }
+
+    proptest! {
+        #[test]
+        fn no_sphere_nearby_has_a_lower_cost(
+            n in 4_usize..3000, half_angle in 0.3_f64..3.0, log_radius in -3.0_f64..4.0, far in -1e3_f64..1e3,
+            known in any::<bool>(), step in prop::array::uniform4(-1.0_f64..1.0),
+        ) {
+            let radius = 10_f64.powf(log_radius);
+            let center = [far * radius, radius, -radius];
+            let points = cap(n, center, radius, half_angle, 1e-4 * radius);
+            let fit = sphere::fit(&points, known.then_some(radius), Noise::default()).unwrap();
+            let least = cost(&points, &fit.surface);
+            prop_assert!((fit.rms_mm - (least / n as f64).sqrt()).abs() < 1e-9 * radius);
+            let mut other = fit.surface;
+            other.center_mm += Vec3::new(step[0], step[1], step[2]) * (1e-4 * radius);
+            other.radius_mm += if known { 0.0 } else { 1e-4 * radius * step[3] };
+            // The plain sum is rounded at the size of the coordinates.
+            let rounding = 1e-15 * (1.0 + far.abs()) * radius * 1e-4 * radius * n as f64;
+            prop_assert!(cost(&points, &other) >= least - rounding);
+        }
+
+        #[test]
+        fn lanes_give_what_a_plain_loop_gives(n in 0_usize..40, x in -2.0_f64..2.0, r in 0.1_f64..3.0) {
+            let local = Local::new(Vec3::zeros(), 1.0);
+            let points = cap(n, [x, 0.3, -0.2], r, 2.0, 0.1);
+            let weights: Vec<f64> = (0..n).map(|i| 0.5 + (i % 3) as f64).collect();
+            let noise = Noise { weights: Some(&weights), sigma_mm: None };
+            let model = sphere::Unknown { center: [0.1, 0.2, 0.3], radius: 1.2 };
+            let sums: Normal<4> = Normal::of(&model, &points, local, &noise);
+            let mut matrix = SMatrix::<f64, 4, 4>::zeros();
+            let (mut gradient, mut cost) = (SVector::<f64, 4>::zeros(), 0.0);
+            for (p, w) in points.iter().zip(&weights) {
+                let (j, d): ([f64; 4], f64) = Model::<4>::row(&model, p);
+                let j = SVector::from(j);
+                matrix += j * j.transpose() * *w;
+                gradient += j * (*w * d);
+                cost += w * d * d;
+            }
+            let size = 1e-13 * (1.0 + n as f64) * 10.0;
+            prop_assert!((sums.matrix - matrix).amax() < size && (sums.gradient - gradient).amax() < size);
+            prop_assert!((sums.cost - cost).abs() < size);
+            // The triangle is a root of the same matrix.
+            if let Some((root, right)) = sums.root {
+                prop_assert!((root.transpose() * root - matrix).amax() < size);
+                prop_assert!((root.transpose() * right + gradient).amax() < size);
+            }
+        }
+
+        #[test]
+        fn nothing_panics(points in prop::collection::vec(prop::array::uniform3(any::<f64>()), 0..9), r in any::<f64>()) {
+            let _ = plane::fit(&points, Noise::default());
+            for radius in [None, Some(r)] {
+                let _ = sphere::fit(&points, radius, Noise::default());
+                let _ = cylinder::fit(&points, radius, Noise::default());
+                let _ = robust::sphere(&points, radius, None, 0);
+                let _ = robust::cylinder(&points, radius, None, 0);
+            }
+            let _ = robust::plane(&points, Some(r), 1);
+            let _ = sphere::through_points(&points);
+            for width in [None, Some(2)] {
+                let _ = spheres::find(&points, width, r, None);
+            }
+        }
+    }
+
+    #[test]
+    fn a_tilted_arc_is_fitted_without_a_hint() {
+        let axis = Vec3::new(0.3, -0.5, 0.8).normalize();
+        let frame = plane::complete(&Vec3::x(), &axis);
+        let points: Vec<[f64; 3]> = (0..5000)
+            .map(|i| {
+                let (t, z) = (1.2 * (f64::from(i) * 0.618).fract(), 80.0 * (f64::from(i) * 0.414).fract());
+                let p = frame.transpose() * Vec3::new(315.0 * t.cos(), 315.0 * t.sin(), z);
+                (p + Vec3::new(900.0, -20.0, 400.0)).into()
+            })
+            .collect();
+        for radius in [None, Some(315.0)] {
+            let fit = cylinder::fit(&points, radius, Noise::default()).unwrap();
+            // Exact points: what is left is the rounding of coordinates of 1000 mm over the arc's sagitta.
+            assert!(fit.surface.axis.cross(&axis).norm() < 1e-12);
+            assert!((fit.surface.radius_mm - 315.0).abs() < 1e-9 && fit.rms_mm < 1e-11);
+            let (robust, inliers) = robust::cylinder(&points, radius, Some(0.01), 0).unwrap();
+            assert!(inliers.len() == points.len() && robust.surface.axis.cross(&axis).norm() < 1e-12);
+        }
+    }
 }

@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, Matrix3, SMatrix, SVector};
 
-use super::{Fit, Local, Model, Moments, Noise, Normal, minimise, rounding};
+use super::{Fit, Local, Model, Moments, Noise, Normal, Number, minimise};
 use crate::Vec3;
 use crate::error::{Error, Result};
 
@@ -34,10 +34,14 @@ struct Unknown {
 }
 
 impl Model<3> for Unknown {
-    #[inline]
-    fn row(&self, q: &[f64; 3]) -> ([f64; 3], f64) {
-        let v = self.axes * (Vec3::from(*q) - self.point);
-        ([-1.0, v[0], v[1]], v[2])
+    #[inline(always)]
+    fn row<T: Number>(&self, q: &[T; 3]) -> ([T; 3], T) {
+        let d: [T; 3] = std::array::from_fn(|k| q[k] - T::of(self.point[k]));
+        let along = |a: usize| {
+            let axis = self.axes.row(a);
+            T::of(axis[0]) * d[0] + T::of(axis[1]) * d[1] + T::of(axis[2]) * d[2]
+        };
+        ([T::of(-1.0), along(0), along(1)], along(2))
     }
 
     fn moved(&self, step: &SVector<f64, 3>) -> Self {
@@ -75,7 +79,7 @@ pub fn fit(points: &[[f64; 3]], noise: Noise) -> Result<Fit<Plane>> {
     let counted = noise.check(points, 3)?;
     let local = Local::of(WHAT, points, &noise)?;
     let moments = Moments::of(points, local, &noise);
-    if moments.variances[1] <= rounding(local).powi(2) {
+    if moments.collinear {
         return Err(Error::Degenerate { what: WHAT, reason: "the points lie on a line".into() });
     }
     if moments.variances[1] - moments.variances[0] <= 1e-12 * moments.variances[1] {

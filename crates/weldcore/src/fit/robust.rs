@@ -84,12 +84,9 @@ pub fn sphere(points: &[[f64; 3]], radius_mm: Option<f64>, sigma_mm: Option<f64>
         require_positive("radius_mm", radius)?;
     }
     let judges = judges(points, seed);
-    let starts = sampled::<4, _>(points, seed, |sample| {
-        let found = sphere::through_points(&sample).ok()?;
-        match radius_mm {
-            None => Some(found),
-            Some(radius) => sphere::fit(&sample, Some(radius), Noise::default()).ok().map(|f| f.surface),
-        }
+    let starts = sampled::<4, _>(points, seed, |sample| match radius_mm {
+        None => sphere::through_four(&sample),
+        Some(radius) => sphere::through_three(&sample, radius),
     });
     let start = best("sphere", &judges, starts, Sphere::distance, sigma_mm)?;
     let refine = |on: &[[f64; 3]], near: &Sphere, noise: Noise| sphere::refine(on, *near, radius_mm.is_none(), noise);
@@ -265,10 +262,12 @@ fn reweighted<S: Copy + Sync>(
         iterations += fit.iterations;
         current = residuals(&surface);
         let next = within(&current, GATE * sigma + rounding);
-        if next == inliers {
+        // A point in a thousand that still comes or goes moves nothing by a part of its uncertainty that matters.
+        let settled = next.len().abs_diff(inliers.len()) <= inliers.len() / 1000;
+        inliers = next;
+        if settled {
             break;
         }
-        inliers = next;
     }
     require_count("points near one surface", needed, inliers.len())?;
     let mut fit = refine(&gather(&inliers), &surface, Noise { weights: None, sigma_mm })?;

@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, Matrix4, SVector, Vector4};
 
-use super::{Fit, Local, Model, Moments, Noise, Normal, minimise, rounding};
+use super::{Fit, Local, Model, Moments, Noise, Normal, Number, minimise};
 use crate::Vec3;
 use crate::error::{Error, Result, require_finite, require_positive};
 
@@ -26,25 +26,25 @@ impl Sphere {
 
 /// Centre and radius unknown (P = 4), or the centre alone (P = 3).
 #[derive(Clone)]
-struct Unknown {
-    center: [f64; 3],
-    radius: f64,
+pub(super) struct Unknown {
+    pub(super) center: [f64; 3],
+    pub(super) radius: f64,
 }
 
-#[inline]
-fn direction(center: &[f64; 3], q: &[f64; 3]) -> ([f64; 3], f64) {
-    let d: [f64; 3] = std::array::from_fn(|k| q[k] - center[k]);
+/// Derivative of the distance by the centre, and the distance.
+#[inline(always)]
+fn pulled<T: Number>(unknown: &Unknown, q: &[T; 3]) -> ([T; 3], T) {
+    let d: [T; 3] = std::array::from_fn(|k| q[k] - T::of(unknown.center[k]));
     let r = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();
-    // A point in the centre has no direction; it pulls nowhere.
-    let s = if r > 0.0 { -1.0 / r } else { 0.0 };
-    (d.map(|v| v * s), r)
+    let s = r.pull();
+    (d.map(|v| v * s), r - T::of(unknown.radius))
 }
 
 impl Model<4> for Unknown {
-    #[inline]
-    fn row(&self, q: &[f64; 3]) -> ([f64; 4], f64) {
-        let (n, r) = direction(&self.center, q);
-        ([n[0], n[1], n[2], -1.0], r - self.radius)
+    #[inline(always)]
+    fn row<T: Number>(&self, q: &[T; 3]) -> ([T; 4], T) {
+        let (n, d) = pulled(self, q);
+        ([n[0], n[1], n[2], T::of(-1.0)], d)
     }
 
     fn moved(&self, step: &SVector<f64, 4>) -> Self {
@@ -53,10 +53,9 @@ impl Model<4> for Unknown {
 }
 
 impl Model<3> for Unknown {
-    #[inline]
-    fn row(&self, q: &[f64; 3]) -> ([f64; 3], f64) {
-        let (n, r) = direction(&self.center, q);
-        (n, r - self.radius)
+    #[inline(always)]
+    fn row<T: Number>(&self, q: &[T; 3]) -> ([T; 3], T) {
+        pulled(self, q)
     }
 
     fn moved(&self, step: &SVector<f64, 3>) -> Self {
@@ -133,12 +132,11 @@ fn fit_in(
 fn start(points: &[[f64; 3]], radius: Option<f64>, local: Local, noise: &Noise) -> Result<Unknown> {
     let moments = Moments::of(points, local, noise);
     // Any sphere through the points of a line turns about it.
-    if moments.variances[1] <= rounding(local).powi(2) {
+    if moments.collinear {
         return Err(Error::Degenerate { what: WHAT, reason: "the points lie on a line".into() });
     }
-    let flat = moments.variances[0] <= rounding(local).powi(2);
     let mut candidates = Vec::new();
-    if !flat {
+    if !moments.coplanar {
         let linear = Linear { axes: moments.axes, mean: moments.mean };
         let normal: Normal<4> = Normal::of(&linear, points, local, noise);
         if let Some(x) = normal.step(0.0) {
@@ -175,10 +173,15 @@ struct Linear {
 }
 
 impl Model<4> for Linear {
-    #[inline]
-    fn row(&self, q: &[f64; 3]) -> ([f64; 4], f64) {
-        let v = self.axes.tr_mul(&(Vec3::from(*q) - self.mean));
-        ([v[0], v[1], v[2], 1.0], -v.norm_squared())
+    #[inline(always)]
+    fn row<T: Number>(&self, q: &[T; 3]) -> ([T; 4], T) {
+        let d: [T; 3] = std::array::from_fn(|k| q[k] - T::of(self.mean[k]));
+        let along = |a: usize| {
+            let axis = self.axes.column(a);
+            T::of(axis[0]) * d[0] + T::of(axis[1]) * d[1] + T::of(axis[2]) * d[2]
+        };
+        let v = [along(0), along(1), along(2)];
+        ([v[0], v[1], v[2], T::of(1.0)], T::of(-1.0) * (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]))
     }
 
     fn moved(&self, _: &SVector<f64, 4>) -> Self {
@@ -213,4 +216,51 @@ pub fn through_points(points: &[[f64; 3]]) -> Result<Sphere> {
     let center = -c.xyz() / 2.0;
     let radius = (c.xyz().norm_squared() - 4.0 * c[3]).max(0.0).sqrt() / 2.0;
     Ok(Sphere { center_mm: local.to_world(&center), radius_mm: radius * local.scale })
+}
+
+/// The sphere of a known radius through the first three points, on the side of the fourth. `None` where there is none.
+pub(super) fn through_three(points: &[[f64; 3]; 4], radius: f64) -> Option<Sphere> {
+    let [a, b, c, d] = points.map(Vec3::from);
+    let (ab, ac) = (b - a, c - a);
+    let normal = ab.cross(&ac);
+    let squared = normal.norm_squared();
+    // Circumcentre of the triangle, from a; then up or down the normal.
+    let foot = (ac * ab.norm_squared() - ab * ac.norm_squared()).cross(&normal) / (2.0 * squared);
+    let height = (radius * radius - foot.norm_squared()).sqrt() / squared.sqrt();
+    let at = |side: f64| Sphere { center_mm: a + foot + normal * (side * height), radius_mm: radius };
+    let (up, down, d) = (at(1.0), at(-1.0), d.into());
+    let near = if down.distance(&d).abs() < up.distance(&d).abs() { down } else { up };
+    near.center_mm.iter().all(|v| v.is_finite()).then_some(near)
+}
+
+/// The sphere through four points, without the care of [`through_points`]. `None` where there is none.
+pub(super) fn through_four(points: &[[f64; 3]; 4]) -> Option<Sphere> {
+    let [a, b, c, d] = points.map(Vec3::from);
+    let (b, c, d) = (b - a, c - a, d - a);
+    let volume = b.dot(&c.cross(&d));
+    let center = (c.cross(&d) * b.norm_squared() + d.cross(&b) * c.norm_squared() + b.cross(&c) * d.norm_squared())
+        / (2.0 * volume);
+    center.iter().all(|v| v.is_finite()).then(|| Sphere { center_mm: a + center, radius_mm: center.norm() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_ways_through_four_points_agree() {
+        let center = Vec3::new(3.0, -4.0, 5.0);
+        let points = [[1.0, 0.2, 0.1], [-0.3, 1.0, 0.4], [0.2, -0.5, -1.0], [-0.6, -0.8, 0.7]]
+            .map(|d| (center + Vec3::from(d).normalize() * 2.5).into());
+        let careful = through_points(&points).unwrap();
+        let quick = through_four(&points).unwrap();
+        let known = through_three(&points, 2.5).unwrap();
+        let fitted = fit(&points, None, Noise::default()).unwrap().surface;
+        for sphere in [careful, quick, known, fitted] {
+            assert!((sphere.center_mm - center).norm() < 1e-13 && (sphere.radius_mm - 2.5).abs() < 1e-13);
+        }
+        assert!(through_three(&points, 1.0).is_none());
+        let flat = [[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 1.0]];
+        assert!(matches!(through_points(&flat), Err(Error::Degenerate { .. })) && through_four(&flat).is_none());
+    }
 }

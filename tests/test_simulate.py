@@ -461,6 +461,17 @@ def test_the_demo_step_is_047_at_its_largest(recorded):
     assert 0.42 < step["mean"] < 0.47 and 0.42 < step["median"] < 0.47
 
 
+def test_bins_go_through_zero_and_the_same_cell_gives_the_same_session(tmp_path):
+    cell = replace(SMALL, part_at_deg=(2.0,), artefact_shots=1, weld=pipe(273.0, offset_at_deg=0.0))
+    first, second = (simulate_session(tmp_path / name, cell) for name in ("a", "b"))
+    assert first == second
+    for file in ("session.json", "touch.csv", "shots/part-1/003.png"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+    bins = [int(c) for c in first["step_mm"]["at_seam_by_deg"]]
+    assert {0, 2, 358} <= set(bins) and all(c % 2 == 0 and 0 <= c < 360 for c in bins) and 180 not in bins
+    assert first["step_mm"]["max_abs_at_deg"] == 0
+
+
 def test_sphere_distances_tell_the_spheres_apart():
     centres = DEFAULT.sphere_centres()
     sides = sorted(float(np.linalg.norm(centres[i] - centres[j])) for i, j in ((0, 1), (1, 2), (2, 0)))

@@ -10,7 +10,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -250,6 +250,25 @@ def make_scanner(
     return Scanner(camera, projector, look_at((0.0, 0.0, distance_mm), position, (0.0, -1.0, 0.0)))
 
 
+def tilted_views(base_from_target: Matrix | Floats, count: int, *, distance_mm: float = 420.0) -> list[Floats]:
+    """Return base_from_scanner per shot of a target whose z faces the scanner: a three-sphere plate, a board.
+
+    Tilted by 30 to 45 degrees to all sides, rolled, near and far: what hand-eye and scanner calibration need.
+    """
+    target = np.asarray(base_from_target)
+    views = []
+    for i in range(count):
+        # The golden section spreads any number of shots around the target.
+        around = 2 * math.pi * (i * 0.381966 + 0.1)
+        tilt = math.radians((31.0, 44.0, 36.0, 40.0, 33.0, 42.0)[i % 6])
+        distance = distance_mm + (0.0, 22.0, -18.0, 10.0, -9.0, 16.0)[i % 6]
+        roll = math.radians((15.0, 105.0, -70.0, 200.0, 60.0, -30.0)[i % 6])
+        direction = np.array([math.sin(tilt) * math.cos(around), math.sin(tilt) * math.sin(around), math.cos(tilt)])
+        view = look_at((0.0, 0.0, 0.0), direction * distance, (0.0, 0.0, 1.0))
+        views.append(target @ view @ placed((0.0, 0.0, 0.0), (0.0, 0.0, roll)))
+    return views
+
+
 # --- the cell ---------------------------------------------------------------------------------------------------------
 
 _HAND_EYE: Matrix = tuple(map(tuple, placed((58.0, -24.0, 112.0), (0.35, -0.22, 1.9)).tolist()))
@@ -334,18 +353,10 @@ class Cell:
 
     def artefact_views(self) -> list[Floats]:
         """Return base_from_scanner per artefact shot: tilted by 30 to 45 degrees to all sides, rolled, near and far."""
-        target = self._on_plate(np.mean(self.spheres_mm, axis=0))
-        plate = np.asarray(self.base_from_plate)[:3, :3]
-        views = []
-        for i in range(self.artefact_shots):
-            around = 2 * math.pi * (i * 0.381966 + 0.1)
-            tilt = math.radians((31.0, 44.0, 36.0, 40.0, 33.0, 42.0)[i % 6])
-            away = (0.0, 22.0, -18.0, 10.0, -9.0, 16.0)[i % 6]
-            direction = np.array([math.sin(tilt) * math.cos(around), math.sin(tilt) * math.sin(around), math.cos(tilt)])
-            position = target + plate @ direction * (self.distance_mm + away)
-            roll = placed((0, 0, 0), (0.0, 0.0, math.radians((15.0, 105.0, -70.0, 200.0, 60.0, -30.0)[i % 6])))
-            views.append(look_at(target, position, plate @ [0.0, 0.0, 1.0]) @ roll)
-        return views
+        target = placed(np.mean(self.spheres_mm, axis=0))
+        return tilted_views(
+            np.asarray(self.base_from_plate) @ target, self.artefact_shots, distance_mm=self.distance_mm
+        )
 
     def part_views(self) -> list[Floats]:
         """Return base_from_scanner per part shot: nearly square to the surface, the image's x along the axis."""
@@ -461,13 +472,10 @@ def _step_of(cell: Cell, deviation: Floats, along: Floats) -> dict[str, Any]:
     if deviation.size == 0:
         return {"points": 0}
     place = along if flat else np.degrees(along) % 360
-    # An even degree is a bin where half a bin on either side was seen.
-    seen = np.unique(np.floor(place).astype(int))
-    bins = [
-        c
-        for c in np.unique(seen + seen % 2)
-        if np.isin([(c - 1) % 360, c % 360] if not flat else [c - 1, c], seen).all()
-    ]
+    # A bin about an even degree counts where either half of it was seen.
+    whole = set(np.floor(place).astype(int).tolist())
+    before = whole if flat else whole | {degree - 360 for degree in whole}
+    bins = sorted(c for c in whole if c % 2 == 0 and c - 1 in before)
     steps = simulated_step(cell.weld, np.asarray(bins, dtype=float) if flat else np.radians(bins))
     counts, edges = np.histogram(deviation, np.arange(deviation.min() - BIN_MM, deviation.max() + 2 * BIN_MM, BIN_MM))
     largest = int(np.abs(steps).argmax()) if bins else None
@@ -475,9 +483,9 @@ def _step_of(cell: Cell, deviation: Floats, along: Floats) -> dict[str, Any]:
         "median": float(np.median(deviation)),
         "mean": float(deviation.mean()),
         "max_abs": None if largest is None else float(abs(steps[largest])),
-        "max_abs_at_deg": None if largest is None else int(bins[largest] % 360),
+        "max_abs_at_deg": None if largest is None else int(bins[largest]),
         "mode": float(edges[counts.argmax()] + BIN_MM / 2),
-        "at_seam_by_deg": {str(int(c) if flat else int(c) % 360): float(s) for c, s in zip(bins, steps, strict=True)},
+        "at_seam_by_deg": {str(int(c)): float(s) for c, s in zip(bins, steps, strict=True)},
         "points": int(deviation.size),
     }
 
@@ -508,7 +516,7 @@ def simulate_session(
         "hand_eye_T_flange_camera": np.asarray(cell.flange_from_scanner).tolist(),
         "sphere_centres_base": cell.sphere_centres().tolist(),
         "T_base_pipe": np.asarray(cell.base_from_weld).tolist(),
-        "part": _plain(asdict(cell.weld)) | {"thickness_mm": cell.thickness_mm},
+        "part": _part_of(cell),
         "shots": {},
     }
     whites: dict[str, Any] = {}
@@ -548,8 +556,20 @@ def simulate_session(
     return truth
 
 
-def _plain(value: Any) -> Any:
-    """Return the value with an infinite radius as null: JSON has no infinity."""
-    if isinstance(value, dict):
-        return {key: _plain(v) for key, v in value.items()}
-    return None if isinstance(value, float) and math.isinf(value) else value
+def _part_of(cell: Cell) -> dict[str, Any]:
+    """Return how the part was made; a plate's radius is null, for JSON has no infinity."""
+    weld, other = cell.weld, cell.weld.other
+    flat = math.isinf(weld.reference.radius_mm)
+    return {
+        "radius": None if flat else weld.reference.radius_mm,
+        "radius_difference": 0.0 if flat else other.radius_mm - weld.reference.radius_mm,
+        "wall": cell.thickness_mm,
+        "offset": other.offset_mm,
+        "tilt": other.tilt_rad,
+        "ovality": [weld.reference.ovality_mm, other.ovality_mm],
+        "waviness": [weld.reference.waviness_mm, other.waviness_mm],
+        "bead_width": weld.bead.width_mm,
+        "bead_height": weld.bead.height_mm,
+        "length": weld.length_mm,
+        "seed": cell.seed,
+    }

@@ -12,6 +12,7 @@ __all__ = [
     "FoundSphere",
     "KdTree",
     "Lens",
+    "Mesh",
     "PhaseMap",
     "Plane",
     "PlaneFit",
@@ -25,6 +26,8 @@ __all__ = [
     "__version__",
     "decode",
     "decode_png",
+    "distance",
+    "estimate_normals",
     "find_spheres",
     "fit_cylinder",
     "fit_plane",
@@ -297,6 +300,27 @@ class Cylinder:
     @property
     def radius_mm(self) -> float: ...
 
+@final
+class Mesh:
+    def __new__(cls, vertices: ArrayLike, triangles: ArrayLike) -> Mesh: ...
+    @property
+    def triangles(self) -> int: ...
+    @property
+    def closed(self) -> bool: ...
+
+def distance(
+    points: ArrayLike,
+    target: ArrayLike | KdTree | Mesh | Plane | Sphere | Cylinder,
+    signed: bool = True,
+    *,
+    normals: ArrayLike | None = None,
+) -> NDArray[np.float64]: ...
+
+# normals
+def estimate_normals(
+    points: ArrayLike, viewpoint: ArrayLike | None = None, *, k: int = 20, window: int = 5
+) -> NDArray[np.float64]: ...
+
 # icp
 @final
 class WeakDirection:
@@ -330,7 +354,7 @@ class Registration:
 
 def register_icp(
     source: ArrayLike,
-    target: ArrayLike | KdTree | Plane | Sphere | Cylinder,
+    target: ArrayLike | KdTree | Mesh | Plane | Sphere | Cylinder,
     metric: Literal["point", "plane"] = "point",
     *,
     normals: ArrayLike | None = None,

@@ -16,9 +16,10 @@ use nalgebra::{Matrix3, Matrix6, Rotation3, SymmetricEigen, Vector6};
 use rayon::prelude::*;
 
 use crate::Vec3;
-use crate::distance::Surface;
+use crate::distance::{Surface, Target};
 use crate::error::{Error, Result, require_count, require_finite, require_positive};
 use crate::kdtree::{Aside, KdTree, Step};
+use crate::mesh::Mesh;
 use crate::threads;
 use crate::transform::Transform;
 
@@ -31,20 +32,13 @@ const FEWEST: usize = 3;
 /// A weak direction is called a translation, or a rotation without pitch, where the rest of it moves the points by
 /// less than this share. It names the direction; it does not change the pose.
 const NAMED: f64 = 0.05;
+/// How far the length of a normal may be from 1: rounding of single precision, or of four decimals.
+const UNIT: f64 = 1e-3;
 /// The median absolute deviation of normal noise, times this, is its standard deviation.
 const MAD: f64 = 1.4826;
 /// Kernel widths in standard deviations at which robust estimates keep 95 % efficiency on normal noise.
 const HUBER: f64 = 1.345;
 const TUKEY: f64 = 4.685;
-
-/// What a cloud is registered to.
-#[derive(Debug, Clone, Copy)]
-pub enum Target<'a> {
-    /// A cloud, and the unit normals of its points where there are any.
-    Cloud(&'a KdTree, Option<&'a [[f64; 3]]>),
-    /// An analytic surface.
-    Surface(Surface),
-}
 
 /// What is minimised.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -217,7 +211,13 @@ fn check(source: &[[f64; 3]], target: &Target, options: &Options) -> Result<()> 
                 let (expected, got) = (format!("{} as in target", tree.len()), n.len().to_string());
                 return Err(Error::Shape { what: "normals", expected, got });
             }
-            Some(n) => require_finite("normals", n)?,
+            Some(n) => {
+                // NaN is a point without a normal; any other length but 1 would scale the residuals.
+                let length = |n: &[f64; 3]| as_vector(n).norm();
+                if let Some(n) = n.iter().find(|n| (length(n) - 1.0).abs() > UNIT) {
+                    return refuse("normals", "unit vectors, or NaN", length(n));
+                }
+            }
             None if options.metric == Metric::Plane => {
                 let reason = "metric plane needs the normals of the target's points".into();
                 return Err(Error::Degenerate { what: "registration", reason });
@@ -310,10 +310,12 @@ impl<'a> Rounds<'a> {
                         let normals = normals.filter(|_| metric == Metric::Plane);
                         to_cloud(tree, normals, pose, source, steps, matches);
                     }
+                    Target::Mesh(mesh) => to_mesh(mesh, pose, source, matches),
                     Target::Surface(surface) => to_surface(surface, pose, source, matches),
                 });
         });
-        self.limit = self.options.max_distance_mm;
+        // A partner without a normal is infinitely far.
+        self.limit = self.options.max_distance_mm.min(f64::MAX);
         let near = self.matches.iter().filter(|m| m.distance <= self.limit).count();
         if self.options.trim > 0.0 && near >= FEWEST {
             let keep = ((near as f64 * (1.0 - self.options.trim)).ceil() as usize).max(FEWEST);
@@ -520,8 +522,18 @@ fn to_cloud(
         found.distance = squared.sqrt();
         if let Some(normal) = normals.and_then(|n| n.get(index as usize)) {
             found.normal = as_vector(normal);
+            if normal[0].is_nan() {
+                found.distance = f64::INFINITY;
+            }
         }
     }
+}
+
+fn to_mesh(mesh: &Mesh, pose: &Transform, source: &[[f64; 3]], matches: &mut [Match]) {
+    let moved: Vec<[f64; 3]> = source.iter().map(|p| pose.apply(&as_vector(p)).into()).collect();
+    mesh.each_near(&moved, matches, |m, foot| {
+        *m = Match { point: foot.point, normal: foot.normal, distance: foot.distance };
+    });
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]

@@ -1,1 +1,417 @@
-//! (to be written)
+//! Surface normals, from the pixel grid and from a bare cloud.
+
+use multiversion::multiversion;
+use rayon::prelude::*;
+
+use crate::error::{Error, Result, require_count};
+use crate::kdtree::{Aside, KdTree, Nearby};
+use crate::threads;
+
+/// Rows of the grid handed to a thread at a time.
+const ROWS: usize = 16;
+/// Pixels of a row treated side by side, so that their sums stay in the nearest cache.
+const SIDE_BY_SIDE: usize = 64;
+/// Neighbours this many times further apart than pixels commonly are lie across a jump: a surface seen so obliquely
+/// (beyond 75°) that its own pixels were that far apart is not measured.
+const JUMP: f64 = 4.0;
+/// Places of a tree handed to a thread at a time.
+const PLACES: usize = 1024;
+/// Below this share of the spread along a line, the spread across it is rounding.
+const ROUNDING: f64 = 1e-12;
+
+/// The normals of a grid of points, `width` to a row, where neighbours in the grid are neighbours on the surface.
+///
+/// The two tangents are the slopes of the least-squares planes of the points over row and column in a window of
+/// `window` by `window` pixels; the normal is square to both, and points to the side of `viewpoint`. Points of the
+/// window that lie across a jump of depth do not count. NaN where there is no point, or its neighbours fix no plane.
+///
+/// # Errors
+/// [`Error::Shape`] where the points are not whole rows, [`Error::OutOfRange`] for a window that is even or below 3,
+/// [`Error::NonFinite`] for the viewpoint.
+pub fn of_grid(points: &[[f64; 3]], width: usize, window: usize, viewpoint: [f64; 3]) -> Result<Vec<[f64; 3]>> {
+    require_viewpoint(viewpoint)?;
+    if width == 0 || !points.len().is_multiple_of(width) {
+        let (expected, got) = (format!("rows of {width}"), format!("{} points", points.len()));
+        return Err(Error::Shape { what: "points", expected, got });
+    }
+    if window < 3 || window.is_multiple_of(2) || window > 1 << 10 {
+        let expected = "odd, from 3 to 1023".into();
+        return Err(Error::OutOfRange { what: "window", expected, value: window.to_string() });
+    }
+    let mut normals = vec![[f64::NAN; 3]; points.len()];
+    let jump = JUMP * common_distance(points, width);
+    threads::install(|| {
+        normals.par_chunks_mut(ROWS * width).enumerate().for_each(|(strip, normals)| {
+            of_strip(&Grid { points, width, reach: window / 2, jump, viewpoint }, strip * ROWS, normals);
+        });
+    });
+    Ok(normals)
+}
+
+/// The median distance of neighbours in a row, over every third pair; 0 where there are none.
+fn common_distance(points: &[[f64; 3]], width: usize) -> f64 {
+    let squared = |pair: &[[f64; 3]]| match pair {
+        [a, b] => (0..3).map(|k| (a[k] - b[k]).powi(2)).sum(),
+        _ => f64::NAN,
+    };
+    let distances =
+        |row: &[[f64; 3]]| -> Vec<f64> { row.windows(2).step_by(3).map(squared).filter(|d| d.is_finite()).collect() };
+    let rows: Vec<Vec<f64>> = threads::install(|| points.par_chunks(width).step_by(3).map(distances).collect());
+    let mut all: Vec<f64> = rows.into_iter().flatten().collect();
+    if all.is_empty() {
+        return 0.0;
+    }
+    let middle = all.len() / 2;
+    all.select_nth_unstable_by(middle, f64::total_cmp).1.sqrt()
+}
+
+struct Grid<'a> {
+    points: &'a [[f64; 3]],
+    width: usize,
+    reach: usize,
+    jump: f64,
+    viewpoint: [f64; 3],
+}
+
+/// Sums over the window of pixels that lie side by side: of 1, i, j, ii, ij, jj, p, i p, j p.
+type Sums = [[f64; SIDE_BY_SIDE]; 15];
+
+#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
+fn of_strip(grid: &Grid, first: usize, normals: &mut [[f64; 3]]) {
+    let (width, reach) = (grid.width, grid.reach);
+    let rows = normals.len() / width;
+    let (top, height) = (first.saturating_sub(reach), grid.points.len() / width);
+    let bottom = (first + rows + reach).min(height);
+    // Coordinate by coordinate, with a margin of NaN at both ends of the rows.
+    let stride = width + 2 * reach + SIDE_BY_SIDE;
+    let mut planes = [vec![], vec![], vec![]];
+    for (axis, plane) in planes.iter_mut().enumerate() {
+        *plane = vec![f64::NAN; stride * (bottom - top)];
+        let rows = grid.points[top * width..bottom * width].chunks(width);
+        for (to, from) in plane.chunks_mut(stride).zip(rows) {
+            for (to, p) in to[reach..].iter_mut().zip(from) {
+                *to = p[axis];
+            }
+        }
+    }
+    let [xs, ys, zs] = &planes;
+    for (r, normals) in normals.chunks_mut(width).enumerate() {
+        let row = first + r;
+        let (low, high) = (row.saturating_sub(reach).max(top), (row + reach + 1).min(bottom));
+        for (block, normals) in normals.chunks_mut(SIDE_BY_SIDE).enumerate() {
+            let here = (row - top) * stride + reach + block * SIDE_BY_SIDE;
+            let mut sums: Sums = [[0.0; SIDE_BY_SIDE]; 15];
+            for near in low..high {
+                let i = near as f64 - row as f64;
+                for shift in 0..=2 * reach {
+                    let j = shift as f64 - reach as f64;
+                    let there = (near - top) * stride + block * SIDE_BY_SIDE + shift;
+                    let jump = (grid.jump * grid.jump) * (i * i + j * j);
+                    let at = |plane: &'_ [f64], from: usize| -> [f64; SIDE_BY_SIDE] {
+                        std::array::from_fn(|k| plane[from..from + SIDE_BY_SIDE][k])
+                    };
+                    let (px, py, pz) = (at(xs, there), at(ys, there), at(zs, there));
+                    let (cx, cy, cz) = (at(xs, here), at(ys, here), at(zs, here));
+                    for k in 0..SIDE_BY_SIDE {
+                        // Relative to the pixel's own point: no cancellation far from the origin.
+                        let (x, y, z) = (px[k] - cx[k], py[k] - cy[k], pz[k] - cz[k]);
+                        let counts = x * x + y * y + z * z <= jump;
+                        let (w, x, y, z) = if counts { (1.0, x, y, z) } else { (0.0, 0.0, 0.0, 0.0) };
+                        sums[0][k] += w;
+                        sums[1][k] += w * i;
+                        sums[2][k] += w * j;
+                        sums[3][k] += w * (i * i);
+                        sums[4][k] += w * (i * j);
+                        sums[5][k] += w * (j * j);
+                        sums[6][k] += x;
+                        sums[7][k] += y;
+                        sums[8][k] += z;
+                        sums[9][k] += i * x;
+                        sums[10][k] += i * y;
+                        sums[11][k] += i * z;
+                        sums[12][k] += j * x;
+                        sums[13][k] += j * y;
+                        sums[14][k] += j * z;
+                    }
+                }
+            }
+            for (k, normal) in normals.iter_mut().enumerate() {
+                let s = |n: usize| sums[n][k];
+                let n = s(0);
+                // What is left of the sums when row and column are taken from their means.
+                let (ii, ij, jj) = (s(3) - s(1) * s(1) / n, s(4) - s(1) * s(2) / n, s(5) - s(2) * s(2) / n);
+                let [u, v] = [(1, 9), (2, 12)].map(|(m, p)| [0, 1, 2].map(|a| s(p + a) - s(m) * s(6 + a) / n));
+                // The tangents are the inverse of [[ii, ij], [ij, jj]] times u and v: their cross product is that of u
+                // and v, times a number above zero. A window of whole steps has no determinant between 0 and 1/n.
+                let determinant = ii * jj - ij * ij;
+                let at = here + k;
+                let to_eye = [grid.viewpoint[0] - xs[at], grid.viewpoint[1] - ys[at], grid.viewpoint[2] - zs[at]];
+                *normal = if determinant * n > 0.5 { towards(&cross(&u, &v), &to_eye) } else { [f64::NAN; 3] };
+            }
+        }
+    }
+}
+
+/// The normals of a bare cloud: square to the least-squares plane of each point's `k` nearest points, itself included,
+/// on the side of `viewpoint`. NaN where these lie on a line or all in one place.
+///
+/// # Errors
+/// Those of [`KdTree::new`], [`Error::OutOfRange`] for `k` below 3, [`Error::TooFew`] below `k` points,
+/// [`Error::NonFinite`] for the viewpoint.
+pub fn of_cloud(points: &[[f64; 3]], k: usize, viewpoint: [f64; 3]) -> Result<Vec<[f64; 3]>> {
+    of_tree(&KdTree::new(points)?, k, viewpoint)
+}
+
+/// [`of_cloud`] for the points of a tree.
+///
+/// # Errors
+/// As [`of_cloud`].
+pub fn of_tree(tree: &KdTree, k: usize, viewpoint: [f64; 3]) -> Result<Vec<[f64; 3]>> {
+    require_viewpoint(viewpoint)?;
+    if k < 3 {
+        return Err(Error::OutOfRange { what: "k", expected: "at least 3".into(), value: k.to_string() });
+    }
+    require_count("points", k, tree.len())?;
+    let places: Vec<usize> = (0..tree.places()).step_by(PLACES).collect();
+    let parts: Vec<Vec<(u32, [f64; 3])>> = threads::install(|| {
+        places
+            .par_iter()
+            .map(|&first| of_places(tree, first, (first + PLACES).min(tree.places()), k, viewpoint))
+            .collect()
+    });
+    let mut normals = vec![[f64::NAN; 3]; tree.len()];
+    for (index, normal) in parts.into_iter().flatten() {
+        if let Some(to) = normals.get_mut(index as usize) {
+            *to = normal;
+        }
+    }
+    Ok(normals)
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
+fn of_places(tree: &KdTree, first: usize, last: usize, k: usize, viewpoint: [f64; 3]) -> Vec<(u32, [f64; 3])> {
+    let mut aside = Aside::new();
+    let mut nearby = Nearby::new(k);
+    let mut normals = Vec::with_capacity(last - first);
+    for place in first..last {
+        let (p, index) = tree.in_place(place as u32);
+        if index as usize >= tree.len() {
+            continue;
+        }
+        tree.nearby(&p, &mut aside, &mut nearby);
+        // Relative to the point itself: no cancellation far from the origin.
+        let (mut sum, mut squares) = ([0.0; 3], [0.0; 6]);
+        for &place in nearby.places() {
+            let (q, _) = tree.in_place(place);
+            let d = [q[0] - p[0], q[1] - p[1], q[2] - p[2]];
+            for a in 0..3 {
+                sum[a] += d[a];
+                squares[a] += d[a] * d[a];
+                squares[3 + a] += d[a] * d[(a + 1) % 3];
+            }
+        }
+        let n = nearby.places().len() as f64;
+        let [xx, yy, zz] = [0, 1, 2].map(|a| squares[a] - sum[a] * sum[a] / n);
+        let [xy, yz, zx] = [0, 1, 2].map(|a| squares[3 + a] - sum[a] * sum[(a + 1) % 3] / n);
+        let to_eye = [viewpoint[0] - p[0], viewpoint[1] - p[1], viewpoint[2] - p[2]];
+        let normal = least_direction([[xx, xy, zx], [xy, yy, yz], [zx, yz, zz]]);
+        normals.push((index, normal.map_or([f64::NAN; 3], |n| towards(&n, &to_eye))));
+    }
+    normals
+}
+
+/// The direction of the least eigenvalue of a symmetric matrix with no eigenvalue below zero, by Jacobi's rotations;
+/// None where the two lowest are both nothing beside the largest.
+#[inline(always)]
+fn least_direction(mut m: [[f64; 3]; 3]) -> Option<[f64; 3]> {
+    let scale = m[0][0] + m[1][1] + m[2][2];
+    if !(scale.is_finite() && scale > 0.0) {
+        return None;
+    }
+    m.iter_mut().flatten().for_each(|v| *v /= scale);
+    let mut vectors = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+    for _ in 0..12 {
+        if m[0][1].abs() + m[1][2].abs() + m[0][2].abs() < f64::EPSILON * 0.01 {
+            break;
+        }
+        for (p, q, r) in [(0, 1, 2), (0, 2, 1), (1, 2, 0)] {
+            if m[p][q] == 0.0 {
+                continue;
+            }
+            let theta = (m[q][q] - m[p][p]) / (2.0 * m[p][q]);
+            let t = theta.signum() / (theta.abs() + (theta * theta + 1.0).sqrt());
+            let c = 1.0 / (t * t + 1.0).sqrt();
+            let s = t * c;
+            let (mpq, mrp, mrq) = (m[p][q], m[r][p], m[r][q]);
+            m[p][p] -= t * mpq;
+            m[q][q] += t * mpq;
+            (m[p][q], m[q][p]) = (0.0, 0.0);
+            (m[r][p], m[r][q]) = (c * mrp - s * mrq, s * mrp + c * mrq);
+            (m[p][r], m[q][r]) = (m[r][p], m[r][q]);
+            for v in &mut vectors {
+                (v[p], v[q]) = (c * v[p] - s * v[q], s * v[p] + c * v[q]);
+            }
+        }
+    }
+    let mut order = [0, 1, 2];
+    order.sort_by(|&a, &b| m[a][a].total_cmp(&m[b][b]));
+    let least = order[0];
+    (m[order[1]][order[1]] > ROUNDING).then_some([vectors[0][least], vectors[1][least], vectors[2][least]])
+}
+
+#[inline(always)]
+fn cross(a: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+/// A unit vector along `v`, turned to the side of `eye`; NaN where `v` has no direction.
+#[inline(always)]
+fn towards(v: &[f64; 3], eye: &[f64; 3]) -> [f64; 3] {
+    let length = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
+    let side = v[0] * eye[0] + v[1] * eye[1] + v[2] * eye[2];
+    let factor = if length > 0.0 { if side < 0.0 { -1.0 / length } else { 1.0 / length } } else { f64::NAN };
+    [v[0] * factor, v[1] * factor, v[2] * factor]
+}
+
+fn require_viewpoint(viewpoint: [f64; 3]) -> Result<()> {
+    match viewpoint.iter().position(|c| !c.is_finite()) {
+        Some(index) => Err(Error::NonFinite { what: "viewpoint", index }),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Vec3;
+
+    fn noise(seed: u64) -> impl FnMut() -> f64 {
+        let mut state = seed;
+        move || {
+            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
+        }
+    }
+
+    /// A ball of 50 mm at 300 mm, seen along rays 0.1 mm apart at that distance, and its true normals.
+    fn ball(width: usize, height: usize) -> (Vec<[f64; 3]>, Vec<[f64; 3]>) {
+        let mut points = Vec::new();
+        let mut normals = Vec::new();
+        for i in 0..height {
+            for j in 0..width {
+                let (x, y) = ((j as f64 - width as f64 / 2.0) * 0.1, (i as f64 - height as f64 / 2.0) * 0.1);
+                let z = (2500.0 - x * x - y * y).sqrt();
+                points.push([x, y, 300.0 - z]);
+                normals.push([x / 50.0, y / 50.0, -z / 50.0]);
+            }
+        }
+        (points, normals)
+    }
+
+    fn worst(found: &[[f64; 3]], truth: &[[f64; 3]]) -> f64 {
+        let angle = |(a, b): (&[f64; 3], &[f64; 3])| (Vec3::from(*a) - Vec3::from(*b)).norm();
+        found.iter().zip(truth).map(angle).fold(0.0, |w, a| if a.is_nan() { f64::NAN } else { f64::max(w, a) })
+    }
+
+    #[test]
+    fn both_find_the_normals_of_a_ball() {
+        let (points, truth) = ball(131, 90);
+        let grid = of_grid(&points, 131, 5, [0.0; 3]).unwrap();
+        let cloud = of_cloud(&points, 20, [0.0; 3]).unwrap();
+        // Inside, symmetric neighbours cancel the curvature; at the rim of the view they lie on one side.
+        assert!(worst(&grid, &truth) < 0.2 / 50.0 && worst(&cloud, &truth) < 0.4 / 50.0);
+        let inside = 65 * 131 / 2;
+        assert!(worst(&grid[inside..=inside], &truth[inside..=inside]) < 1e-4);
+    }
+
+    #[test]
+    fn a_plane_is_exact_far_away_and_seen_from_either_side() {
+        let truth = Vec3::new(0.3, -0.5, -1.0).normalize();
+        let points: Vec<[f64; 3]> = (0..2000)
+            .map(|i| {
+                let (x, y) = (f64::from(i % 50), f64::from(i / 50));
+                [1e6 + x, 1e6 + y, 1e6 + 0.3 * x - 0.5 * y]
+            })
+            .collect();
+        for (side, viewpoint) in [(1.0, [1e6, 1e6, 0.0]), (-1.0, [1e6, 1e6, 2e6])] {
+            let expected = vec![<[f64; 3]>::from(truth * side); 2000];
+            // Coordinates of 1e6 mm are rounded to 1e-10 mm.
+            assert!(worst(&of_grid(&points, 50, 3, viewpoint).unwrap(), &expected) < 1e-9);
+            assert!(worst(&of_cloud(&points, 9, viewpoint).unwrap(), &expected) < 1e-9);
+        }
+    }
+
+    #[test]
+    fn missing_points_and_jumps_of_depth_do_not_count() {
+        let mut noise = noise(1);
+        let (width, height) = (60, 40);
+        let mut points: Vec<[f64; 3]> = (0..width * height)
+            .map(|i| {
+                let (x, y) = ((i % width) as f64 * 0.1, (i / width) as f64 * 0.1);
+                // A step of 5 mm between two level plates.
+                [x, y, if i % width < 30 { 300.0 } else { 305.0 }]
+            })
+            .collect();
+        for p in &mut points {
+            if noise() > 0.2 {
+                *p = [f64::NAN; 3];
+            }
+        }
+        points[7 * width + 7] = [0.7, 0.7, 300.0];
+        let normals = of_grid(&points, width, 5, [0.0; 3]).unwrap();
+        let mut found = 0;
+        for (p, n) in points.iter().zip(&normals) {
+            assert!(!p[0].is_nan() || n[0].is_nan());
+            if !n[0].is_nan() {
+                found += 1;
+                assert!((Vec3::from(*n) - Vec3::new(0.0, 0.0, -1.0)).norm() < 1e-12, "{p:?} {n:?}");
+            }
+        }
+        assert!(found > 1200, "{found}");
+    }
+
+    #[test]
+    fn noise_averages_out() {
+        let (mut points, truth) = ball(100, 100);
+        let mut noise = noise(3);
+        points.iter_mut().for_each(|p| p[2] += 0.01 * noise());
+        let rms = |found: Vec<[f64; 3]>| {
+            let squares: f64 =
+                found.iter().zip(&truth).map(|(a, b)| (Vec3::from(*a) - Vec3::from(*b)).norm_squared()).sum();
+            (squares / 1e4).sqrt()
+        };
+        // A slope over 5 x 5 pixels of 0.1 mm: sigma / (0.1 sqrt(50)), in two directions; more at the rim of the view.
+        let expected = 0.01 / 12f64.sqrt() / (0.1 * 50f64.sqrt()) * 2f64.sqrt();
+        assert!((0.9..1.3).contains(&(rms(of_grid(&points, 100, 5, [0.0; 3]).unwrap()) / expected)));
+        assert!((0.9..1.6).contains(&(rms(of_cloud(&points, 25, [0.0; 3]).unwrap()) / expected)));
+    }
+
+    #[test]
+    fn any_number_of_threads_gives_the_same_bits() {
+        let (points, _) = ball(200, 150);
+        let answers: Vec<_> = [1, 2, 8]
+            .iter()
+            .map(|&n| {
+                threads::set_threads(Some(n)).unwrap();
+                (of_grid(&points, 200, 5, [0.0; 3]).unwrap(), of_cloud(&points, 12, [0.0; 3]).unwrap())
+            })
+            .collect();
+        threads::set_threads(None).unwrap();
+        assert!(answers.windows(2).all(|w| w[0] == w[1]));
+    }
+
+    #[test]
+    fn lines_have_no_normal_and_bad_input_is_refused() {
+        let line: Vec<[f64; 3]> = (0..40).map(|i| [f64::from(i), 2.0 * f64::from(i), 0.0]).collect();
+        assert!(of_cloud(&line, 5, [0.0; 3]).unwrap().iter().flatten().all(|v| v.is_nan()));
+        assert!(of_cloud(&[[1.0; 3]; 9], 5, [0.0; 3]).unwrap().iter().flatten().all(|v| v.is_nan()));
+        assert!(of_grid(&line, 40, 3, [0.0; 3]).unwrap().iter().flatten().all(|v| v.is_nan()));
+        assert!(of_grid(&[], 4, 3, [0.0; 3]).unwrap().is_empty());
+        assert!(matches!(of_grid(&line, 7, 3, [0.0; 3]), Err(Error::Shape { .. })));
+        assert!(matches!(of_grid(&line, 8, 4, [0.0; 3]), Err(Error::OutOfRange { .. })));
+        assert!(matches!(of_grid(&line, 8, 3, [f64::NAN; 3]), Err(Error::NonFinite { .. })));
+        assert!(matches!(of_cloud(&line, 2, [0.0; 3]), Err(Error::OutOfRange { .. })));
+        assert!(matches!(of_cloud(&line, 41, [0.0; 3]), Err(Error::TooFew { .. })));
+        assert!(matches!(of_cloud(&[[f64::NAN; 3]; 9], 3, [0.0; 3]), Err(Error::NonFinite { .. })));
+    }
+}

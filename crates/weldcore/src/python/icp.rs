@@ -1,40 +1,17 @@
 //! Iterative closest point as Python sees it.
 
-use numpy::ndarray::{Array2, Ix2};
-use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray2};
+use numpy::ndarray::Array2;
+use numpy::{IntoPyArray, PyArray1, PyArray2};
 use pyo3::prelude::*;
 
-use super::distance::{PyCylinder, PyPlane, PySphere, array, words};
-use super::kdtree::PyKdTree;
+use super::distance::{Given, array, words};
+use super::normals::NEIGHBOURS;
 use super::transform::rows;
-use super::{compute, float_matrix, floats, points, raise, transform};
-use crate::distance::Surface;
-use crate::error::{Error, Result};
-use crate::icp::{self, Kernel, Kind, Metric, Options, Registration, Target, Weak};
-use crate::kdtree::KdTree;
-
-/// Whatever a cloud can be held against.
-pub(crate) enum Given<'py> {
-    Tree(Py<PyKdTree>),
-    Points(PyReadonlyArray2<'py, f64>),
-    Surface(Surface),
-}
-
-impl<'py> Given<'py> {
-    pub(crate) fn new(target: &Bound<'py, PyAny>) -> PyResult<Self> {
-        Ok(if let Ok(tree) = target.cast::<PyKdTree>() {
-            Self::Tree(tree.clone().unbind())
-        } else if let Ok(plane) = target.cast::<PyPlane>() {
-            Self::Surface(Surface::Plane(plane.get().0))
-        } else if let Ok(sphere) = target.cast::<PySphere>() {
-            Self::Surface(Surface::Sphere(sphere.get().0))
-        } else if let Ok(cylinder) = target.cast::<PyCylinder>() {
-            Self::Surface(Surface::Cylinder(cylinder.get().0))
-        } else {
-            Self::Points(floats::<Ix2>("target", target)?)
-        })
-    }
-}
+use super::{float_matrix, points, raise, transform};
+use crate::distance::Target;
+use crate::error::Error;
+use crate::icp::{self, Kernel, Kind, Metric, Options, Registration, Weak};
+use crate::normals;
 
 /// A direction along which `register_icp` did not move the pose, because the pairs do not show it.
 #[pyclass(frozen, module = "weldscan", name = "WeakDirection")]
@@ -157,9 +134,10 @@ impl PyRegistration {
 ///
 /// Args:
 ///     source: (n, 3), mm, n >= 3.
-///     target: (m, 3) points, mm, or a `KdTree` of them (saves building it), or a `Plane`, `Sphere` or `Cylinder`.
+///     target: (m, 3) points, mm, a `KdTree` of them (saves building it), a `Mesh`, a `Plane`, `Sphere` or `Cylinder`.
 ///     metric: "point" or "plane". "plane" converges in a few rounds; "point" creeps along smooth surfaces.
-///     normals: (m, 3) unit normals of the target's points, needed for a cloud with metric "plane".
+///     normals: (m, 3) unit normals of the target's points, for a cloud with metric "plane"; points with NaN do not
+///         count. None estimates them as `estimate_normals(target)` does.
 ///     start: (4, 4) target_from_source to start from; None is the identity.
 ///     max_distance_mm: pairs further apart do not count.
 ///     trim: share of the pairs, the ones furthest apart, that does not count, 0 to below 1.
@@ -176,7 +154,7 @@ impl PyRegistration {
 ///
 /// Raises:
 ///     InputError: a wrong shape, NaN or infinity, an option out of range.
-///     GeometryError: fewer than three points, metric "plane" without normals, fewer than three pairs that count.
+///     GeometryError: fewer than three points, or fewer than three pairs that count.
 ///
 /// Source: Besl & McKay, A method for registration of 3-D shapes, PAMI 14 (1992) 239; Chen & Medioni, Object modelling
 /// by registration of multiple range images, IVC 10 (1992) 145.
@@ -238,30 +216,16 @@ fn register_icp(
         Options { metric, start, max_distance_mm, trim, kernel, max_iterations, tolerance_mm, weak, max_points };
     let source = float_matrix("source", source)?;
     let source = points("source", &source)?;
-    let normals = normals.map(|n| float_matrix("normals", n)).transpose()?;
-    let normals = normals.as_ref().map(|n| points("normals", n)).transpose()?;
-    let found = match &Given::new(target)? {
-        Given::Tree(tree) => {
-            let tree = &tree.get().tree;
-            compute(py, || icp::register(source, &Target::Cloud(tree, normals), &options))
+    let given = normals.map(|n| float_matrix("normals", n)).transpose()?;
+    let given = given.as_ref().map(|n| points("normals", n)).transpose()?;
+    let found = Given::new(target)?.compute(py, given, |target| match target {
+        Target::Cloud(tree, None) if metric == Metric::Plane => {
+            let estimated = normals::of_tree(tree, NEIGHBOURS.min(tree.len()), [0.0; 3])?;
+            icp::register(source, &Target::Cloud(tree, Some(&estimated)), &options)
         }
-        Given::Points(array) => {
-            let target = points("target", array)?;
-            compute(py, || icp::register(source, &Target::Cloud(&tree_of(target)?, normals), &options))
-        }
-        Given::Surface(surface) => compute(py, || icp::register(source, &Target::Surface(*surface), &options)),
-    };
-    Ok(PyRegistration(found?))
-}
-
-/// The tree of the target: errors name it.
-pub(crate) fn tree_of(target: &[[f64; 3]]) -> Result<KdTree> {
-    KdTree::new(target).map_err(|error| match error {
-        Error::TooFew { needed, got, .. } => Error::TooFew { what: "target", needed, got },
-        Error::NonFinite { index, .. } => Error::NonFinite { what: "target", index },
-        Error::OutOfRange { expected, value, .. } => Error::OutOfRange { what: "target", expected, value },
-        other => other,
-    })
+        target => icp::register(source, target, &options),
+    })?;
+    Ok(PyRegistration(found))
 }
 
 pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {

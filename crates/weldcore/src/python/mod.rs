@@ -12,6 +12,7 @@ mod fit;
 mod icp;
 mod image;
 mod kdtree;
+mod normals;
 mod phase;
 mod scanner;
 mod simulate;
@@ -125,6 +126,7 @@ fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
     distance::register(m)?;
     icp::register(m)?;
     image::register(m)?;
+    normals::register(m)?;
     simulate::register(m)?;
     Ok(())
 }

@@ -16,10 +16,10 @@ use rayon::prelude::*;
 use crate::error::{Error, Result, require_count, require_finite};
 use crate::threads;
 
-/// Points in a leaf and children of a node: one AVX-512 vector, two of AVX2.
-const WIDTH: usize = 8;
-/// Ranges below this are ordered without handing half of them to another thread.
-const SERIAL: usize = 16 * 1024;
+mod boxes;
+
+pub(crate) use boxes::{Aside, BoxTree, Extent, Item, Visit, WIDTH, max, min, order};
+
 /// Queries handed to a thread at a time.
 const QUERIES: usize = 1024;
 /// Coordinates beyond this would overflow when squared.
@@ -30,28 +30,11 @@ const FAR: f64 = f64::MAX;
 const NOWHERE: u32 = u32::MAX;
 /// Some units in the last place, relative: far more than a distance is off by.
 const ROUNDING: f64 = 64.0 * f64::EPSILON;
-/// Levels that 2³² points need, each with at most `WIDTH - 1` children put aside.
-const DEEPEST: usize = 11 * (WIDTH - 1) + 1;
 
 /// Eight points, coordinate by coordinate.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
 struct Leaf([[f64; WIDTH]; 3]);
-
-/// The bounding boxes of eight children; a child that does not exist is infinitely far.
-#[derive(Clone, Copy)]
-#[repr(C, align(64))]
-struct Boxes {
-    low: [[f64; WIDTH]; 3],
-    high: [[f64; WIDTH]; 3],
-}
-
-/// A point on its way into the tree.
-#[derive(Clone, Copy)]
-struct Item {
-    at: [f64; 3],
-    index: u32,
-}
 
 /// A k-d tree over a cloud. It keeps its own copy of the points.
 #[derive(Clone)]
@@ -60,10 +43,7 @@ pub struct KdTree {
     leaves: Vec<Leaf>,
     /// Which point each place of a leaf holds.
     indices: Vec<[u32; WIDTH]>,
-    /// All levels one after the other, from the parents of the leaves up to the root.
-    boxes: Vec<Boxes>,
-    /// Where each level starts in `boxes`.
-    levels: Vec<usize>,
+    boxes: BoxTree,
 }
 
 impl KdTree {
@@ -85,11 +65,7 @@ impl KdTree {
 
     fn build(points: &[[f64; 3]]) -> Self {
         let mut items: Vec<Item> = points.par_iter().enumerate().map(|(i, &at)| Item { at, index: i as u32 }).collect();
-        let mut reach = WIDTH;
-        while reach * WIDTH < items.len() {
-            reach *= WIDTH;
-        }
-        order(&mut items, reach);
+        order(&mut items);
         let blank = (Leaf([[f64::INFINITY; WIDTH]; 3]), [u32::MAX; WIDTH]);
         let (leaves, indices): (Vec<Leaf>, Vec<[u32; WIDTH]>) = items
             .par_chunks(WIDTH)
@@ -105,26 +81,8 @@ impl KdTree {
             })
             .unzip();
         drop(items);
-        let mut tree = Self { len: points.len(), leaves, indices, boxes: Vec::new(), levels: Vec::new() };
-        tree.bound();
-        tree
-    }
-
-    /// The boxes, from the leaves up to one root.
-    fn bound(&mut self) {
-        let around_leaves: Vec<Boxes> =
-            self.leaves.par_chunks(WIDTH).map(|leaves| Boxes::around(leaves.iter().map(Leaf::extent))).collect();
-        self.boxes = around_leaves;
-        self.levels.push(0);
-        let mut start = 0;
-        while self.boxes.len() - start > 1 {
-            let above: Vec<Boxes> =
-                self.boxes[start..].chunks(WIDTH).map(|nodes| Boxes::around(nodes.iter().map(Boxes::extent))).collect();
-            start = self.boxes.len();
-            self.levels.push(start);
-            self.boxes.extend(above);
-        }
-        self.boxes.shrink_to_fit();
+        let boxes = BoxTree::new(&leaves, Leaf::extent);
+        Self { len: points.len(), leaves, indices, boxes }
     }
 
     /// How many points are in the tree.
@@ -139,7 +97,7 @@ impl KdTree {
 
     /// What the tree takes, in bytes.
     pub fn bytes(&self) -> usize {
-        size_of_val(&*self.leaves) + size_of_val(&*self.indices) + size_of_val(&*self.boxes)
+        size_of_val(&*self.leaves) + size_of_val(&*self.indices) + self.boxes.bytes()
     }
 
     /// The nearest point to each query: distances, mm, and indices; of equally distant points the lowest index.
@@ -155,6 +113,18 @@ impl KdTree {
                 .for_each(|(queries, distance, index)| nearest_of(self, queries, distance, index));
         });
         Ok((distance, index))
+    }
+
+    /// The distance of the nearest point to each query, mm, negative where the query is behind that point's normal.
+    pub(crate) fn signed(&self, queries: &[[f64; 3]], normals: &[[f64; 3]]) -> Result<Vec<f64>> {
+        require_range("points", queries)?;
+        let mut distance = vec![0.0; queries.len()];
+        threads::install(|| {
+            (queries.par_chunks(QUERIES), distance.par_chunks_mut(QUERIES))
+                .into_par_iter()
+                .for_each(|(queries, distance)| signed_of(self, normals, queries, distance));
+        });
+        Ok(distance)
     }
 
     /// The `k` nearest points to each query, nearest first, equally distant ones by index: distances, mm, and indices,
@@ -210,7 +180,7 @@ impl KdTree {
     pub(crate) fn follow(&self, q: &[f64; 3], step: &mut Step, aside: &mut Aside) -> (f64, u32) {
         let mut found = NearestTwo { squared: FAR, second: FAR, index: u32::MAX, place: 0 };
         if step.place == NOWHERE {
-            self.dive(q, &mut found);
+            self.offer_leaf(self.boxes.dive(q), q, &mut found);
         } else {
             let (p, index) = self.in_place(step.place);
             let squared = squared_distance(&p, q);
@@ -226,68 +196,35 @@ impl KdTree {
         (found.squared, found.place)
     }
 
-    /// The search that all others share: offers every point that may be nearer than `found.bound()`, near boxes first.
+    /// How many places the tree has: its points, and blanks in the last leaf with an index beyond the points.
+    pub(crate) fn places(&self) -> usize {
+        self.leaves.len() * WIDTH
+    }
+
+    /// The places of the points nearest to `q`, in no order; of equally distant points those of the lowest index.
+    /// Starts from what `nearby` knows of the last query: the points that were near that are not far from this one.
+    #[inline(always)]
+    pub(crate) fn nearby(&self, q: &[f64; 3], aside: &mut Aside, nearby: &mut Nearby) {
+        nearby.start(q);
+        self.search(q, aside, nearby);
+        nearby.finish(q);
+    }
+
+    /// Offers every point that may be nearer than `found.bound()`.
     #[inline(always)]
     fn search(&self, q: &[f64; 3], aside: &mut Aside, found: &mut impl Found) {
-        let mut depth = 0;
-        let (mut level, mut node) = (self.levels.len() - 1, 0);
-        loop {
-            let near = self.boxes[self.levels[level] + node].squared_distances(q);
-            let (first, least) = least(&near);
-            if least <= found.bound() {
-                if level == 0 {
-                    self.offer_leaf(node * WIDTH + first, q, found);
-                }
-                let mut others = at_most(&near, found.bound()) & !(1 << first);
-                while others != 0 {
-                    let child = others.trailing_zeros() as usize & (WIDTH - 1);
-                    others &= others - 1;
-                    if level > 0 {
-                        aside.0[depth] = (near[child], (level - 1) as u32, (node * WIDTH + child) as u32);
-                        depth += 1;
-                    } else if near[child] <= found.bound() {
-                        self.offer_leaf(node * WIDTH + child, q, found);
-                    }
-                }
-                if level > 0 {
-                    (level, node) = (level - 1, node * WIDTH + first);
-                    continue;
-                }
-            }
-            loop {
-                if depth == 0 {
-                    return;
-                }
-                depth -= 1;
-                let (distance, l, n) = aside.0[depth];
-                if distance <= found.bound() {
-                    (level, node) = (l as usize, n as usize);
-                    break;
-                }
-            }
-        }
+        self.boxes.search(q, aside, &mut Leaves { tree: self, q, found });
     }
 
     #[inline(always)]
     fn offer_leaf(&self, leaf: usize, q: &[f64; 3], found: &mut impl Found) {
         let distances = self.leaves[leaf].squared_distances(q);
-        let mut near = at_most(&distances, found.bound());
+        let mut near = boxes::at_most(&distances, found.bound());
         while near != 0 {
             let place = near.trailing_zeros() as usize & (WIDTH - 1);
             near &= near - 1;
             found.offer(distances[place], self.indices[leaf][place], (leaf * WIDTH + place) as u32);
         }
-    }
-
-    /// A first guess without looking back: the nearest point of the leaf that is reached by nearest boxes.
-    #[inline(always)]
-    fn dive(&self, q: &[f64; 3], found: &mut impl Found) {
-        let mut node = 0;
-        for &start in self.levels.iter().rev() {
-            let (first, _) = least(&self.boxes[start + node].squared_distances(q));
-            node = node * WIDTH + first;
-        }
-        self.offer_leaf(node, q, found);
     }
 }
 
@@ -335,20 +272,30 @@ pub struct Within {
     pub index: Vec<u32>,
 }
 
-/// Boxes put aside during a search: squared distance, level, node.
-pub(crate) struct Aside([(f64, u32, u32); DEEPEST]);
-
-impl Aside {
-    pub(crate) fn new() -> Self {
-        Self([(0.0, 0, 0); DEEPEST])
-    }
-}
-
 /// What a search looks for.
 trait Found {
     /// Points further than this (squared) are of no interest; points exactly as far may be.
     fn bound(&self) -> f64;
     fn offer(&mut self, squared: f64, index: u32, place: u32);
+}
+
+/// Looks for points in the leaves.
+struct Leaves<'a, F> {
+    tree: &'a KdTree,
+    q: &'a [f64; 3],
+    found: &'a mut F,
+}
+
+impl<F: Found> Visit for Leaves<'_, F> {
+    #[inline(always)]
+    fn bound(&self) -> f64 {
+        self.found.bound()
+    }
+
+    #[inline(always)]
+    fn visit(&mut self, leaf: usize) {
+        self.tree.offer_leaf(leaf, self.q, self.found);
+    }
 }
 
 /// The nearest.
@@ -395,6 +342,70 @@ impl Found for NearestTwo {
             (self.squared, self.index, self.place) = (squared, index, place);
         } else if squared < self.second {
             self.second = squared;
+        }
+    }
+}
+
+/// The `k` nearest in no order: candidates are collected, and thinned out when there are many.
+pub(crate) struct Nearby {
+    k: usize,
+    bound: f64,
+    /// Squared distance, index, place.
+    candidates: Vec<(f64, u32, u32)>,
+    places: Vec<u32>,
+    /// The last query and the distance of its `k`-th neighbour.
+    last: Option<([f64; 3], f64)>,
+}
+
+impl Nearby {
+    pub(crate) fn new(k: usize) -> Self {
+        Self { k, bound: FAR, candidates: Vec::new(), places: Vec::new(), last: None }
+    }
+
+    /// What the last search found.
+    pub(crate) fn places(&self) -> &[u32] {
+        &self.places
+    }
+
+    fn start(&mut self, q: &[f64; 3]) {
+        self.candidates.clear();
+        // The last query's k points are no further from this one than the way between the two and then their distance.
+        self.bound = self.last.map_or(FAR, |(p, reach)| {
+            let far = (squared_distance(&p, q).sqrt() + reach) * (1.0 + ROUNDING);
+            min(far * far, FAR)
+        });
+    }
+
+    fn thin(&mut self) {
+        let by_distance = |a: &(f64, u32, u32), b: &(f64, u32, u32)| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1));
+        if self.candidates.len() >= self.k {
+            self.candidates.select_nth_unstable_by(self.k - 1, by_distance);
+            self.candidates.truncate(self.k);
+            self.bound = self.candidates[self.k - 1].0;
+        }
+    }
+
+    fn finish(&mut self, q: &[f64; 3]) {
+        self.thin();
+        self.places.clear();
+        self.places.extend(self.candidates.iter().map(|c| c.2));
+        self.last = Some((*q, self.bound.sqrt()));
+    }
+}
+
+impl Found for Nearby {
+    #[inline(always)]
+    fn bound(&self) -> f64 {
+        self.bound
+    }
+
+    #[inline(always)]
+    fn offer(&mut self, squared: f64, index: u32, place: u32) {
+        if squared <= self.bound {
+            self.candidates.push((squared, index, place));
+            if self.candidates.len() >= 2 * self.k + WIDTH {
+                self.thin();
+            }
         }
     }
 }
@@ -472,9 +483,20 @@ fn nearest_of(tree: &KdTree, queries: &[[f64; 3]], distance: &mut [f64], index: 
     let mut aside = Aside::new();
     for ((q, distance), index) in queries.iter().zip(distance).zip(index) {
         let mut found = Nearest { squared: FAR, index: u32::MAX };
-        tree.dive(q, &mut found);
+        tree.offer_leaf(tree.boxes.dive(q), q, &mut found);
         tree.search(q, &mut aside, &mut found);
         (*distance, *index) = (found.squared.sqrt(), found.index);
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
+fn signed_of(tree: &KdTree, normals: &[[f64; 3]], queries: &[[f64; 3]], distance: &mut [f64]) {
+    let mut aside = Aside::new();
+    for (q, distance) in queries.iter().zip(distance) {
+        let (squared, place) = tree.follow(q, &mut Step::NEW.clone(), &mut aside);
+        let (p, index) = tree.in_place(place);
+        let ahead = normals.get(index as usize).map_or(0.0, |n| (0..3).map(|k| n[k] * (q[k] - p[k])).sum::<f64>());
+        *distance = if ahead < 0.0 { -squared.sqrt() } else { squared.sqrt() };
     }
 }
 
@@ -516,53 +538,8 @@ fn within_of(tree: &KdTree, queries: &[[f64; 3]], r: f64) -> Vec<Within> {
     answers
 }
 
-/// Orders the points so that each run of `reach`, `reach / 8`, ... 8 points from the start is compact in space.
-fn order(items: &mut [Item], mut reach: usize) {
-    if items.len() <= WIDTH {
-        return;
-    }
-    while items.len() <= reach {
-        reach /= WIDTH;
-    }
-    let middle = items.len().div_ceil(reach) / 2 * reach;
-    match widest(items) {
-        0 => select::<0>(items, middle),
-        1 => select::<1>(items, middle),
-        _ => select::<2>(items, middle),
-    }
-    let (low, high) = items.split_at_mut(middle);
-    if low.len() > SERIAL {
-        rayon::join(|| order(low, reach), || order(high, reach));
-    } else {
-        order(low, reach);
-        order(high, reach);
-    }
-}
-
-fn select<const AXIS: usize>(items: &mut [Item], middle: usize) {
-    items.select_nth_unstable_by(middle, |a, b| a.at[AXIS].total_cmp(&b.at[AXIS]));
-}
-
-fn widest(items: &[Item]) -> usize {
-    let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
-    for item in items {
-        for axis in 0..3 {
-            low[axis] = min(low[axis], item.at[axis]);
-            high[axis] = max(high[axis], item.at[axis]);
-        }
-    }
-    let side = [high[0] - low[0], high[1] - low[1], high[2] - low[2]];
-    if side[0] >= side[1] && side[0] >= side[2] {
-        0
-    } else if side[1] >= side[2] {
-        1
-    } else {
-        2
-    }
-}
-
 /// Fails where a coordinate is not finite, or too large to be squared.
-fn require_range(what: &'static str, points: &[[f64; 3]]) -> Result<()> {
+pub(crate) fn require_range(what: &'static str, points: &[[f64; 3]]) -> Result<()> {
     if points.iter().flatten().all(|c| c.abs() <= LARGEST_COORDINATE) {
         return Ok(());
     }
@@ -571,41 +548,10 @@ fn require_range(what: &'static str, points: &[[f64; 3]]) -> Result<()> {
     Err(Error::OutOfRange { what, expected, value: "a larger one".into() })
 }
 
-// One vector instruction each, unlike `f64::min` and `max`, which have rules about NaN.
-#[inline(always)]
-fn min(a: f64, b: f64) -> f64 {
-    if a < b { a } else { b }
-}
-
-#[inline(always)]
-fn max(a: f64, b: f64) -> f64 {
-    if a > b { a } else { b }
-}
-
 #[inline(always)]
 fn squared_distance(p: &[f64; 3], q: &[f64; 3]) -> f64 {
     let (x, y, z) = (p[0] - q[0], p[1] - q[1], p[2] - q[2]);
     (x * x + y * y) + z * z
-}
-
-/// The lowest of eight and its place.
-#[inline(always)]
-fn least(values: &[f64; WIDTH]) -> (usize, f64) {
-    let mut least = values[0];
-    for &v in values {
-        least = min(v, least);
-    }
-    (at_most(values, least).trailing_zeros() as usize & (WIDTH - 1), least)
-}
-
-/// A bit for each of the eight that is not above `bound`.
-#[inline(always)]
-fn at_most(values: &[f64; WIDTH], bound: f64) -> u32 {
-    let mut bits = 0;
-    for (i, &v) in values.iter().enumerate() {
-        bits |= u32::from(v <= bound) << i;
-    }
-    bits
 }
 
 impl Leaf {
@@ -618,38 +564,9 @@ impl Leaf {
     }
 
     /// The box around the points, low and high corner; places without a point do not count.
-    fn extent(&self) -> ([f64; 3], [f64; 3]) {
+    fn extent(&self) -> Extent {
         let high = |row: [f64; WIDTH]| row.into_iter().filter(|&v| v != f64::INFINITY).fold(f64::NEG_INFINITY, max);
         (self.0.map(|row| row.into_iter().fold(f64::INFINITY, min)), self.0.map(high))
-    }
-}
-
-impl Boxes {
-    fn around(children: impl Iterator<Item = ([f64; 3], [f64; 3])>) -> Self {
-        let mut boxes = Self { low: [[f64::INFINITY; WIDTH]; 3], high: [[f64::NEG_INFINITY; WIDTH]; 3] };
-        for (i, (low, high)) in children.enumerate() {
-            for axis in 0..3 {
-                boxes.low[axis][i] = low[axis];
-                boxes.high[axis][i] = high[axis];
-            }
-        }
-        boxes
-    }
-
-    #[inline(always)]
-    fn squared_distances(&self, q: &[f64; 3]) -> [f64; WIDTH] {
-        std::array::from_fn(|i| {
-            let outside = |axis: usize| max(max(self.low[axis][i] - q[axis], q[axis] - self.high[axis][i]), 0.0);
-            let (x, y, z) = (outside(0), outside(1), outside(2));
-            (x * x + y * y) + z * z
-        })
-    }
-
-    fn extent(&self) -> ([f64; 3], [f64; 3]) {
-        (
-            self.low.map(|row| row.into_iter().fold(f64::INFINITY, min)),
-            self.high.map(|row| row.into_iter().fold(f64::NEG_INFINITY, max)),
-        )
     }
 }
 

@@ -55,11 +55,19 @@ from weldscan.pose import (
 
 if TYPE_CHECKING:
     from weldscan.norms import judge, limit_mm, norm_ids
+    from weldscan.report import write_report
+    from weldscan.report.validation import write_validation
+    from weldscan.result import Inspection, Label, Validation, Verdict
     from weldscan.session import Session, iter_frames, read_frames, read_session, write_session
+    from weldscan.validation import validate
 
 # The faces are imported when they are asked for: they bring pydantic and OpenCV, which an algorithm does not need.
 _LAZY = {
     "weldscan.norms": ("judge", "limit_mm", "norm_ids"),
+    "weldscan.report": ("write_report",),
+    "weldscan.report.validation": ("write_validation",),
+    "weldscan.result": ("Inspection", "Label", "Validation", "Verdict"),
+    "weldscan.validation": ("validate",),
     "weldscan.session": ("Session", "iter_frames", "read_frames", "read_session", "write_session"),
 }
 
@@ -81,8 +89,10 @@ __all__ = [
     "FoundSphere",
     "GeometryError",
     "InputError",
+    "Inspection",
     "KdTree",
     "KukaPose",
+    "Label",
     "Lens",
     "Mesh",
     "NotMeasured",
@@ -96,6 +106,8 @@ __all__ = [
     "SimulatedShot",
     "Sphere",
     "SphereFit",
+    "Validation",
+    "Verdict",
     "WeakDirection",
     "WeldscanError",
     "__version__",
@@ -128,5 +140,8 @@ __all__ = [
     "simulated_step",
     "sphere_through_points",
     "triangulate",
+    "validate",
+    "write_report",
     "write_session",
+    "write_validation",
 ]

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -167,16 +167,28 @@ def calibrate_hand_eye(
 def validate(
     session: SessionFolder,
     touch: Annotated[Path, typer.Option(help="Points that a contact probe read on the part: x_mm,y_mm,z_mm in base.")],
-    out: Annotated[Path | None, typer.Option(help="Also write validation.json and validation.html there.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Where validation.json and validation.html go. Default: SESSION's name + '-touch'."),
+    ] = None,
 ) -> None:
-    """Hold the scanned surface against points probed on the part."""
+    """Hold the scanned surface against points probed on the part: the signed distance of each, with its uncertainty."""
+    from weldscan.report.validation import is_validation, write_validation
+    from weldscan.session import whole_folder
+    from weldscan.validation import read_touch
     from weldscan.validation import validate as hold_against
 
+    out = out if out is not None else Path(f"{session.resolve().name}-touch")
+    whole_folder.check(out, is_validation)
+    read_touch(touch)
     with _progress() as progress:
-        found: Any = hold_against(session, touch, progress)
-    print(found)
-    if out is not None:
-        print(out)
+        found = hold_against(session, touch, progress)
+        write_validation(found, out)
+    print(
+        f"{found.compared} of {len(found.points_mm)} probed points: rms {found.rms_mm:.3f} mm, "
+        f"mean {found.mean_mm:+.3f} ± {found.mean_u_mm:.3f} mm (k = 2), largest {found.max_abs_mm:.3f} mm"
+    )
+    print(f"report: {out / 'validation.html'}")
 
 
 # --- behind the commands ----------------------------------------------------------------------------------------------

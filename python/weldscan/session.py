@@ -714,3 +714,18 @@ def to_json(document: Any) -> str:
     text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
     # No string holds a raw line break, so that what is joined here is white space between values.
     return re.sub(r"\[\n[^\[\]{}\"]*\]", lambda found: "[" + " ".join(found[0][1:-1].split()) + "]", text) + "\n"
+
+
+def plain(value: Any) -> Any:
+    """Python's own types all through, and None for NaN and infinity."""
+    if isinstance(value, Mapping):
+        return {str(name): plain(item) for name, item in value.items()}
+    if isinstance(value, str):
+        return str(value)
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, Sequence):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -7,7 +7,7 @@ import io
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from datetime import UTC, datetime
@@ -20,7 +20,7 @@ import numpy as np
 from weldscan._weldcore import __version__
 from weldscan.report import charts, pictures
 from weldscan.result import ArtefactShot, HandEye, Inspection, Judgement, Label, PartCloud, StepResult, Verdict
-from weldscan.session import to_json, whole_folder
+from weldscan.session import plain, to_json, whole_folder
 
 SCHEMA = "weldscan-result/1"
 FILES = ("result.json", "report.html", "profile.csv", "cloud.ply")
@@ -121,8 +121,8 @@ def result_document(inspection: Inspection, created: datetime) -> dict[str, Any]
         "timing_s": inspection.timing_s,
         "software": {"version": __version__, **inspection.software},
     }
-    plain: dict[str, Any] = _plain(document)
-    return plain
+    result: dict[str, Any] = plain(document)
+    return result
 
 
 def _step(step: StepResult | None) -> dict[str, Any]:
@@ -201,21 +201,6 @@ def counts(cloud: PartCloud | None) -> dict[str, int]:
     label = np.zeros(0, np.uint8) if cloud is None else cloud.label
     per_label = np.bincount(label, minlength=len(Label))
     return {"points": int(label.size)} | {name: int(per_label[value]) for name, value in CLASSES.items()}
-
-
-def _plain(value: Any) -> Any:
-    """Python's own types all through, and None for NaN and infinity."""
-    if isinstance(value, Mapping):
-        return {str(name): _plain(item) for name, item in value.items()}
-    if isinstance(value, str):
-        return str(value)
-    if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
-    if isinstance(value, Sequence):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def profile_csv(step: StepResult | None) -> str:

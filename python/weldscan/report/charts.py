@@ -47,6 +47,27 @@ class Svg:
         d = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points) + ("Z" if close else "")
         self.add("path", d=d, class_=class_)
 
+    def upright(self, x: float, y: float, content: str) -> None:
+        """The title of a vertical axis."""
+        self.add(
+            "text", content, transform=f"translate({x:.0f} {y:.0f}) rotate(-90)", class_="axis", text_anchor="middle"
+        )
+
+    def colour_bar(self, y: float, scale_mm: float, below: str, above: str) -> None:
+        """The diverging scale from -`scale_mm` to `scale_mm`."""
+        x0, x1 = WIDTH * 0.28, WIDTH * 0.72
+        self.parts.append('<defs><linearGradient id="deviation">')
+        for i, (red, green, blue) in enumerate(diverging(np.linspace(-1, 1, 17)).tolist()):
+            self.parts.append(f'<stop offset="{i / 16:.4f}" stop-color="#{red:02x}{green:02x}{blue:02x}"/>')
+        self.parts.append("</linearGradient></defs>")
+        self.add("rect", x=x0, y=float(y), width=x1 - x0, height=12.0, fill="url(#deviation)", class_="frame-filled")
+        for tick in nice_ticks(-scale_mm, scale_mm, 6):
+            at = x0 + (tick + scale_mm) / (2 * scale_mm) * (x1 - x0)
+            self.line(at, y + 12, at, y + 16, "zero")
+            self.text(at, y + 29, number(tick), "tick")
+        self.text(x0 - 10, y + 11, below, "tick", "end")
+        self.text(x1 + 10, y + 11, above, "tick", "start")
+
     def __str__(self) -> str:
         return "".join(self.parts) + "</svg>"
 
@@ -145,13 +166,7 @@ def step_chart(step: StepResult, limit_mm: float | None, judged: tuple[float, fl
     for tick in nice_ticks(low, high, 7):
         svg.line(LEFT, y(tick), WIDTH - RIGHT, y(tick), "zero" if tick == 0 else "grid")
         svg.text(LEFT - 9, y(tick) + 4, number(tick), "tick", "end")
-    svg.add(
-        "text",
-        "step, mm",
-        transform=f"translate(16 {(top + bottom) / 2:.0f}) rotate(-90)",
-        class_="axis",
-        text_anchor="middle",
-    )
+    svg.upright(16, (top + bottom) / 2, "step, mm")
     for limit in () if limit_mm is None else (limit_mm, -limit_mm):
         if low <= limit <= high:
             band = (y(min(limit + guard, high)), y(max(limit - guard, low)))
@@ -207,26 +222,8 @@ def map_chart(pictures: Sequence[str], extent: Extent, scale_mm: float) -> str:
     for tick in nice_ticks(extent.low_mm, extent.high_mm, 5):
         svg.line(LEFT - 5, y(tick), LEFT, y(tick), "zero")
         svg.text(LEFT - 9, y(tick) + 4, number(tick), "tick", "end")
-    svg.add(
-        "text",
-        "along the axis, mm",
-        transform=f"translate(16 {(top + bottom) / 2:.0f}) rotate(-90)",
-        class_="axis",
-        text_anchor="middle",
-    )
-    x0, x1, y0 = WIDTH * 0.28, WIDTH * 0.72, bottom + 58
-    svg.parts.append('<defs><linearGradient id="deviation">')
-    for i in range(17):
-        red, green, blue = diverging(np.array([i / 8 - 1]))[0]
-        svg.parts.append(f'<stop offset="{i / 16:.4f}" stop-color="#{red:02x}{green:02x}{blue:02x}"/>')
-    svg.parts.append("</linearGradient></defs>")
-    svg.add("rect", x=x0, y=float(y0), width=x1 - x0, height=12.0, fill="url(#deviation)", class_="frame-filled")
-    for tick in nice_ticks(-scale_mm, scale_mm, 6):
-        at = x0 + (tick + scale_mm) / (2 * scale_mm) * (x1 - x0)
-        svg.line(at, y0 + 12, at, y0 + 16, "zero")
-        svg.text(at, y0 + 29, number(tick), "tick")
-    svg.text(x0 - 10, y0 + 11, "inwards", "tick", "end")
-    svg.text(x1 + 10, y0 + 11, "outwards, mm", "tick", "start")
+    svg.upright(16, (top + bottom) / 2, "along the axis, mm")
+    svg.colour_bar(bottom + 58, scale_mm, "inwards", "outwards, mm")
     return str(svg)
 
 
@@ -265,13 +262,7 @@ def histogram_chart(histogram: Histogram) -> str:
         anchor, aside = ("end", -8) if at > WIDTH * 0.7 else ("start", 8)
         svg.text(at + aside, top + 16, f"mean of the kept {histogram.step_mm:.3f} mm", "mark-label", anchor)
     svg.text((LEFT + WIDTH - RIGHT) / 2, bottom + 40, "distance of the other wall from the modelled pipe, mm", "axis")
-    svg.add(
-        "text",
-        "points",
-        transform=f"translate(16 {(top + bottom) / 2:.0f}) rotate(-90)",
-        class_="axis",
-        text_anchor="middle",
-    )
+    svg.upright(16, (top + bottom) / 2, "points")
     return str(svg)
 
 

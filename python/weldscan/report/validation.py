@@ -1,0 +1,161 @@
+"""Writes what a comparison with probed points found: `validation.json` and `validation.html`."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from datetime import UTC, datetime
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from weldscan._weldcore import __version__
+from weldscan.report.charts import LEFT, RIGHT, WIDTH, AngleAxis, Svg, arcs_of, nice_ticks, number
+from weldscan.report.pictures import diverging
+from weldscan.result import Validation
+from weldscan.session import plain, to_json, whole_folder
+
+SCHEMA = "weldscan-validation/1"
+FILES = ("validation.json", "validation.html")
+PAPER_MM = 0.115
+
+
+def write_validation(found: Validation, out_dir: str | os.PathLike[str]) -> Path:
+    """Writes both files as a whole folder and returns its path; the rules are those of `write_report`."""
+    created = datetime.now(UTC)
+    out = Path(out_dir)
+    with whole_folder(out, is_validation) as folder:
+        (folder / "validation.json").write_text(to_json(plain(document(found, created))), encoding="utf-8")
+        (folder / "validation.html").write_text(html(found, created), encoding="utf-8")
+    return out
+
+
+def is_validation(folder: Path) -> bool:
+    """Whether a folder is an earlier comparison and holds nothing else."""
+    names = {entry.name for entry in folder.iterdir()}
+    try:
+        schema = json.loads((folder / "validation.json").read_text(encoding="utf-8"))["schema"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return names <= set(FILES) and schema == SCHEMA
+
+
+def document(found: Validation, created: datetime) -> dict[str, Any]:
+    """`weldscan-validation/1`."""
+    return {
+        "schema": SCHEMA,
+        "created": created.isoformat(timespec="seconds"),
+        "session": found.session,
+        "touch": found.touch,
+        "points": len(found.points_mm),
+        "compared": found.compared,
+        "mean_mm": found.mean_mm,
+        "mean_u_mm": found.mean_u_mm,
+        "rms_mm": found.rms_mm,
+        "max_abs_mm": found.max_abs_mm,
+        "per_point": [
+            {"point_mm": row[:3], "angle_deg": row[3], "axial_mm": row[4], "distance_mm": row[5], "u_mm": row[6]}
+            for row in _rows(found)
+        ],
+        "uncertainty_budget": [
+            {"name": line.name, "standard_mm": line.standard_mm, "derived_from": line.derived_from}
+            for line in found.budget
+        ],
+        "software": {"version": __version__, **found.software},
+    }
+
+
+def _rows(found: Validation) -> list[list[float]]:
+    rows: list[list[float]] = np.column_stack(
+        [found.points_mm, found.angle_deg, found.axial_mm, found.distance_mm, found.u_mm]
+    ).tolist()
+    return rows
+
+
+def html(found: Validation, created: datetime) -> str:
+    """The page: one file without any reference to another."""
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
+
+    here = resources.files("weldscan.report")
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+
+    def shown(value: float, digits: int = 3) -> str:
+        return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else "–"
+
+    return environment.from_string((here / "validation.html").read_text(encoding="utf-8")).render(
+        v=found,
+        css=Markup((here / "style.css").read_text(encoding="utf-8")),
+        version=__version__,
+        created=created.strftime("%Y-%m-%d %H:%M UTC"),
+        typical_u=float(np.nanmedian(found.u_mm)),
+        where=Markup(str(where(found))),
+        distances=Markup(str(distances(found))),
+        rows=_rows(found),
+        mm=shown,
+        number=shown,
+    )
+
+
+def where(found: Validation) -> Svg:
+    """The probed points on the unrolled part, coloured by their distance."""
+    top, bottom = 14, 250
+    svg = Svg(WIDTH, 356, "Probed points on the unrolled part, coloured by their distance from the scanned surface")
+    placed = np.isfinite(found.angle_deg)
+    angles = AngleAxis(arcs_of(found.angle_deg[placed].tolist(), bridge_deg=20))
+    angles.draw(svg, top, bottom)
+    low, high = float(found.axial_mm[placed].min()), float(found.axial_mm[placed].max())
+    margin = 0.06 * (high - low) + 1.0
+    low, high = low - margin, high + margin
+
+    def y(value: float) -> float:
+        return top + (high - value) / (high - low) * (bottom - top)
+
+    for tick in nice_ticks(low, high, 5):
+        svg.line(LEFT, y(tick), WIDTH - RIGHT, y(tick), "zero" if tick == 0 else "grid")
+        svg.text(LEFT - 9, y(tick) + 4, number(tick), "tick", "end")
+    svg.upright(16, (top + bottom) / 2, "along the axis, mm")
+    scale = next((s for s in (0.05, 0.1, 0.2, 0.5, 1.0, 2.0) if s >= found.max_abs_mm), found.max_abs_mm)
+    for angle, axial, distance in zip(found.angle_deg, found.axial_mm, found.distance_mm, strict=True):
+        place = angles(float(angle)) if math.isfinite(angle) else None
+        if place is None:
+            continue
+        x = place[1]
+        if not math.isfinite(distance):
+            svg.path([(x - 4, y(axial) - 4), (x + 4, y(axial) + 4)], "limit")
+            svg.path([(x - 4, y(axial) + 4), (x + 4, y(axial) - 4)], "limit")
+            continue
+        red, green, blue = diverging(np.array([distance / scale]))[0]
+        svg.add("circle", cx=x, cy=y(axial), r=6.5, fill=f"#{red:02x}{green:02x}{blue:02x}", class_="probed")
+    svg.colour_bar(bottom + 58, scale, "inside the scan", "outside, mm")
+    return svg
+
+
+def distances(found: Validation) -> Svg:
+    """The distances in order of the angle, each with its U."""
+    top, bottom = 16, 236
+    svg = Svg(WIDTH, 270, "Signed distance of each probed point with its uncertainty")
+    good = np.flatnonzero(np.isfinite(found.distance_mm))
+    order = good[np.argsort(found.angle_deg[good], kind="stable")]
+    reach = max(1.1 * PAPER_MM, 1.08 * float(np.max(np.abs(found.distance_mm[good]) + found.u_mm[good])))
+
+    def y(value: float) -> float:
+        return (top + bottom) / 2 - value / reach * (bottom - top) / 2
+
+    svg.add("rect", x=LEFT, y=top, width=WIDTH - LEFT - RIGHT, height=bottom - top, class_="panel")
+    for tick in nice_ticks(-reach, reach, 7):
+        svg.line(LEFT, y(tick), WIDTH - RIGHT, y(tick), "zero" if tick == 0 else "grid")
+        svg.text(LEFT - 9, y(tick) + 4, number(tick), "tick", "end")
+    for limit in (PAPER_MM, -PAPER_MM):
+        svg.line(LEFT, y(limit), WIDTH - RIGHT, y(limit), "limit")
+    for place, i in enumerate(order):
+        x = LEFT + (place + 0.5) / len(order) * (WIDTH - LEFT - RIGHT)
+        value, u = float(found.distance_mm[i]), float(found.u_mm[i])
+        svg.line(x, y(value - u), x, y(value + u), "whisker")
+        svg.add("circle", cx=x, cy=y(value), r=3.2, class_="dot")
+    svg.upright(16, (top + bottom) / 2, "distance, mm")
+    svg.text((LEFT + WIDTH - RIGHT) / 2, bottom + 22, "probed points, by angle", "axis")
+    return svg

@@ -1,0 +1,189 @@
+"""Holds the scanned surface against points that a contact probe read on the part (the paper's 115 um)."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldscan._weldcore import KdTree
+from weldscan.calibration.artefact import TOUCH_SIGMA_MM
+from weldscan.calibration.hand_eye import POSE_SIGMA_MM, POSE_SIGMA_RAD
+from weldscan.errors import InputError, NotMeasured
+from weldscan.inspection import inspect
+from weldscan.result import BudgetLine, PartCloud, Validation
+from weldscan.session import read_session, read_text
+
+Floats = NDArray[np.float64]
+
+HEADER = "x_mm,y_mm,z_mm"
+# The patch of surface around a probed point: wide enough to average a scanner's noise over hundreds of points, small
+# against a pipe's radius and a bead's width, so that a quadric describes it.
+PATCH_MM = 1.5
+# Six coefficients, five times over.
+MIN_PATCH_POINTS = 30
+# Where the patch's points lie to one side of the probed point by more than this share of its radius, the surface ends
+# there, and the quadric would be extrapolated. A half disc is off by 0.42.
+MAX_ONE_SIDED = 0.3
+# A probed point further off than this from its patch does not belong to this surface.
+MAX_DISTANCE_MM = PATCH_MM
+
+
+# Points whose noise goes together, about: the decode of a pixel draws on the same projector column as its neighbours.
+CORRELATED_POINTS = 4
+
+
+def validate(
+    session_folder: str | os.PathLike[str],
+    touch_csv: str | os.PathLike[str],
+    progress: Callable[[int, int, str], None] | None = None,
+) -> Validation:
+    """The signed distance of each probed point from the scanned surface around it, with its uncertainty.
+
+    Around each probed point the scanned points within 1.5 mm are described by a quadric (least squares, once more
+    without those beyond three sigma); the distance is taken along its normal, positive away from the pipe's axis.
+
+    Args:
+        session_folder: a `weldscan-session/1` folder with a robot.
+        touch_csv: a file with the header `x_mm,y_mm,z_mm` and a point in base per line.
+        progress: called with (done, total, what).
+
+    Returns:
+        Validation; points where nothing was scanned have NaN.
+
+    Raises:
+        InputError: the session or the file is wrong, or the session has no robot, so that nothing is in base.
+        NotMeasured: none of the probed points lies on scanned surface.
+    """
+    touched = read_touch(Path(touch_csv))
+    session = read_session(session_folder)
+    if not session.has_robot:
+        raise InputError(f"{session.folder / 'session.json'}: robot: without one, nothing says where base is")
+    found = inspect(session_folder, progress=progress)
+    cloud = found.cloud
+    if cloud is None:
+        raise NotMeasured("; ".join(judgement.reason for judgement in found.verdicts) or "nothing was scanned")
+    flanges = [(s.flange_pose.X, s.flange_pose.Y, s.flange_pose.Z) for s in session.part_shots if s.flange_pose]
+    lever = float(np.mean([np.linalg.norm(touched - np.array(flange), axis=1).min() for flange in flanges]))
+    pose = math.hypot(POSE_SIGMA_MM, POSE_SIGMA_RAD * lever)
+    hand_eye = found.hand_eye.working_point_u_mm if found.hand_eye else 0.0
+    shared = (
+        BudgetLine("hand-eye", hand_eye, "covariance of the calibration, at the working distance"),
+        BudgetLine("robot pose", pose, f"{POSE_SIGMA_MM:g} mm and {POSE_SIGMA_RAD:.1e} rad at {lever:.0f} mm"),
+    )
+    return hold_against(touched, cloud, shared, session=found.session, touch=str(touch_csv), software=found.software)
+
+
+def hold_against(
+    touched_mm: Floats,
+    cloud: PartCloud,
+    shared: tuple[BudgetLine, ...] = (),
+    *,
+    session: str = "",
+    touch: str = "",
+    software: dict[str, str] | None = None,
+) -> Validation:
+    """`validate` for a cloud that is there already; `shared` are the uncertainties that all points have in common."""
+    angle, axial = (np.full(len(touched_mm), np.nan) for _ in range(2))
+    distance, noise = np.full(len(touched_mm), np.nan), np.full(len(touched_mm), np.nan)
+    outwards = _outwards(cloud)
+    _, near = KdTree(cloud.points_mm).radius(touched_mm, PATCH_MM)
+    for i, patch in enumerate(near):
+        if len(patch) == 0:
+            continue
+        turn = np.exp(1j * np.radians(cloud.angle_deg[patch].astype(float))).mean()
+        angle[i], axial[i] = np.degrees(np.angle(turn)) % 360, cloud.axial_mm[patch].mean()
+        held = _distance(touched_mm[i], cloud.points_mm[patch], outwards(angle[i]))
+        if held is not None:
+            distance[i], noise[i] = held
+    good = np.isfinite(distance)
+    if not good.any():
+        raise NotMeasured(f"none of the {len(touched_mm)} probed points lies on scanned surface")
+    common = math.hypot(*(line.standard_mm for line in shared), 0.0)
+    own = np.hypot(TOUCH_SIGMA_MM, noise)
+    values = distance[good]
+    return Validation(
+        session=session,
+        touch=touch,
+        points_mm=touched_mm,
+        distance_mm=distance,
+        u_mm=2 * np.hypot(common, own),
+        angle_deg=angle,
+        axial_mm=axial,
+        mean_mm=float(values.mean()),
+        rms_mm=float(np.sqrt(np.square(values).mean())),
+        max_abs_mm=float(np.abs(values).max()),
+        mean_u_mm=2 * math.hypot(common, float(np.sqrt(np.square(own[good]).mean() / good.sum()))),
+        budget=(
+            *shared,
+            BudgetLine("probe", TOUCH_SIGMA_MM, "contact probing with the robot"),
+            BudgetLine("scanned surface", float(np.median(noise[good])), f"quadric over a patch of {PATCH_MM:g} mm"),
+        ),
+        software=software or {},
+    )
+
+
+def _outwards(cloud: PartCloud) -> Callable[[float], Floats]:
+    """The direction away from the axis, by angle; its cos and sin are linear in the position but for the deviation."""
+    few = slice(None, None, max(1, len(cloud.label) // 4000))
+    angle = np.radians(cloud.angle_deg[few].astype(float))
+    terms = np.stack([np.ones_like(angle), cloud.axial_mm[few], np.cos(angle), np.sin(angle)], axis=1)
+    _, _, zero, quarter = np.linalg.lstsq(terms, cloud.points_mm[few], rcond=None)[0]
+    return lambda deg: math.cos(math.radians(deg)) * zero + math.sin(math.radians(deg)) * quarter
+
+
+def _distance(point: Floats, patch: Floats, outward: Floats) -> tuple[float, float] | None:
+    """Signed distance of a point from the quadric through its patch, and the quadric's standard uncertainty there."""
+    if len(patch) < MIN_PATCH_POINTS:
+        return None
+    aside, along, normal = np.linalg.svd(patch - patch.mean(axis=0), full_matrices=False)[2]
+    normal = normal if normal @ outward > 0 else -normal
+    offset = patch - point
+    u, v, w = offset @ aside, offset @ along, offset @ normal
+    if math.hypot(u.mean(), v.mean()) > MAX_ONE_SIDED * PATCH_MM:
+        return None
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+    keep = np.ones(len(w), bool)
+    for _ in range(2):
+        solution = np.linalg.lstsq(terms[keep], w[keep], rcond=None)[0]
+        residual = w - terms @ solution
+        sigma = float(np.sqrt(np.square(residual[keep]).sum() / (keep.sum() - 6)))
+        keep = np.abs(residual) <= 3 * max(sigma, 1e-9)
+        if keep.sum() < MIN_PATCH_POINTS:
+            return None
+    height, slope_u, slope_v = (float(value) for value in solution[:3])
+    if abs(height) > MAX_DISTANCE_MM:
+        return None
+    # The point is the origin: it stands -height above the quadric, measured along w, hence the cosine of the slope.
+    variance = sigma**2 * float(np.linalg.inv(terms[keep].T @ terms[keep])[0, 0])
+    # Neighbouring pixels share camera and projector pixels; a patch holds fewer independent points than points.
+    return -height / math.sqrt(1 + slope_u**2 + slope_v**2), math.sqrt(variance * CORRELATED_POINTS)
+
+
+def read_touch(path: Path) -> Floats:
+    """The probed points of a `touch.csv`, (n, 3), mm, base.
+
+    Raises:
+        InputError: names file and line.
+    """
+    lines = read_text(path).splitlines()
+    if not lines or lines[0].replace(" ", "") != HEADER:
+        raise InputError(f"{path}: line 1: should read {HEADER}")
+    points = []
+    for number, line in enumerate(lines[1:], 2):
+        if not line.strip():
+            continue
+        try:
+            point = [float(cell) for cell in line.split(",")]
+        except ValueError:
+            raise InputError(f"{path}: line {number}: {line[:60]!r} is not three numbers") from None
+        if len(point) != 3 or not all(abs(value) <= 1e9 for value in point):
+            raise InputError(f"{path}: line {number}: {line[:60]!r} is not three numbers")
+        points.append(point)
+    if not points:
+        raise InputError(f"{path}: holds no points")
+    return np.array(points)

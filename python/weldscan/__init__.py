@@ -59,7 +59,6 @@ if TYPE_CHECKING:
     from weldscan.report.validation import write_validation
     from weldscan.result import Inspection, Label, Validation, Verdict
     from weldscan.session import Session, iter_frames, read_frames, read_session, write_session
-    from weldscan.validation import validate
 
 # The faces are imported when they are asked for: they bring pydantic and OpenCV, which an algorithm does not need.
 _LAZY = {
@@ -67,7 +66,6 @@ _LAZY = {
     "weldscan.report": ("write_report",),
     "weldscan.report.validation": ("write_validation",),
     "weldscan.result": ("Inspection", "Label", "Validation", "Verdict"),
-    "weldscan.validation": ("validate",),
     "weldscan.session": ("Session", "iter_frames", "read_frames", "read_session", "write_session"),
 }
 
@@ -140,7 +138,6 @@ __all__ = [
     "simulated_step",
     "sphere_through_points",
     "triangulate",
-    "validate",
     "write_report",
     "write_session",
     "write_validation",

@@ -188,8 +188,8 @@ def surfaces(rng: np.random.Generator, noise: float) -> list[tuple[str, Callable
     """Name, fit, noise-free points, true parameters in the order of the covariance."""
     del noise
     n = 400
-    ball = cap(rng, n, 10, 1.0) + [1, 2, 300]
-    pipe = arc(rng, n, 50, 1.5, 60) + [5, -3, 200]
+    ball = cap(rng, n, 10, 1.0) + np.array([1, 2, 300])
+    pipe = arc(rng, n, 50, 1.5, 60) + np.array([5, -3, 200])
     plate = np.c_[rng.uniform(-20, 20, (n, 2)), np.full(n, 400.0)]
     return [
         ("ball", weldscan.fit_sphere, ball, np.array([1, 2, 300, 10.0])),

@@ -213,7 +213,7 @@ const JUDGES: usize = 300;
 /// Points on which the best directions are refined.
 const SAMPLE: usize = 3000;
 /// Directions refined.
-const REFINED: usize = 12;
+const REFINED: usize = 16;
 
 /// Starts, best first: already minimised on a sample of the points.
 fn starts(points: &[[f64; 3]], radius: Option<f64>, local: Local, noise: &Noise, moments: &Moments) -> Vec<Unknown> {
@@ -223,7 +223,14 @@ fn starts(points: &[[f64; 3]], radius: Option<f64>, local: Local, noise: &Noise,
         counted.iter().step_by(step).filter_map(|&i| points.get(i)).map(|p| local.to_local(p)).collect()
     };
     let (judges, sample) = (pick(JUDGES), pick(SAMPLE));
-    let tried: Vec<Vec3> = moments.axes.column_iter().map(Into::into).chain(directions(DIRECTIONS)).collect();
+    // A slender cloud has a valley as narrow as itself: the same directions again as its whitened points see them.
+    let spread = moments.variances.map(|v| v.max(1e-8 * moments.variances[2]).sqrt());
+    let stretched = |d: Vec3| (moments.axes * spread.component_mul(&d)).normalize();
+    let whitened = |d: &Vec3| moments.axes.tr_mul(d).component_div(&spread).normalize();
+    let tried: Vec<Vec3> = (moments.axes.column_iter().map(Into::into))
+        .chain(directions(DIRECTIONS))
+        .chain(directions(DIRECTIONS).map(stretched))
+        .collect();
     let judged = threads::map_each(&tried, |axis| circle(&judges, any_frame(axis), radius));
     let mut order: Vec<(f64, Unknown)> = judged.into_iter().flatten().collect();
     order.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -231,7 +238,11 @@ fn starts(points: &[[f64; 3]], radius: Option<f64>, local: Local, noise: &Noise,
     let mut kept: Vec<Unknown> = Vec::new();
     for (_, candidate) in order {
         let axis = Vec3::from(candidate.axes[2]);
-        if kept.len() < REFINED && kept.iter().all(|k| Vec3::from(k.axes[2]).dot(&axis).abs() < 0.97) {
+        let alike = |k: &Unknown| {
+            let other = Vec3::from(k.axes[2]);
+            other.dot(&axis).abs() > 0.97 && whitened(&other).dot(&whitened(&axis)).abs() > 0.97
+        };
+        if kept.len() < REFINED && !kept.iter().any(alike) {
             kept.push(candidate);
         }
     }

@@ -12,6 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from weldscan import GeometryError, InputError, Lens, Scanner, SimulatedShot, set_threads, simulate_shot, simulated_step
 from weldscan.devices.simulated import (
@@ -549,12 +551,57 @@ def test_wrong_poses_and_bodies_are_refused():
         lambda: shoot([object()]),  # type: ignore[list-item]
         lambda: shoot(PLANE, exposures=[0.0]),
         lambda: shoot(PLANE, exposures=[]),
+        lambda: shoot(PLANE, [("x", 8, 1000)], exposures=[1.0, 2.0, 3.0]),
         lambda: simulated_step(TILTED, [math.nan]),
         lambda: simulated_step("weld", [0.0]),
     ]
     for call in calls:
         with pytest.raises((InputError, GeometryError)):
             call()
+
+
+# Scenes of any proportions, one number of which may be anything: rendered or refused, and nothing else happens.
+LIMITS = {
+    "radius": (1.0, 2e3),
+    "x": (-50, 50),
+    "y": (-50, 50),
+    "tilt_x": (-0.49, 0.49),
+    "tilt_y": (-0.49, 0.49),
+    "ovality": (-20, 20),
+    "at": (-9, 9),
+    "waviness": (0, 1),
+    "width": (0, 100),
+    "height": (0, 30),
+    "ripple": (0, 5),
+    "pitch": (0.1, 50),
+    "wander": (0, 20),
+    "depth": (0, 2e3),
+    "periods": (0.1, 300),
+    "gamma": (0.2, 5),
+}
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    scene=st.fixed_dictionaries({name: st.floats(*limits) for name, limits in LIMITS.items()}),
+    broken=st.one_of(st.none(), st.tuples(st.sampled_from(sorted(LIMITS)), st.floats())),
+)
+def test_no_scene_makes_it_fail_in_another_way(scene, broken):
+    s = scene | ({broken[0]: broken[1]} if broken else {})
+    other = Wall(s["radius"], (s["x"], s["y"]), (s["tilt_x"], s["tilt_y"]), s["ovality"], s["at"], s["waviness"])
+    weld = Weld(Wall(s["radius"]), other, Bead(s["width"], s["height"], s["ripple"], s["pitch"], s["wander"]))
+    pose = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, s["depth"]], [0, 0, 0, 1]])
+    bodies = [Body(weld, pose), Body(Sphere(10.0), placed((0.0, 0.0, 400.0)), label=9)]
+    photometry = Photometry(gamma=s["gamma"], blur_px=0.3)
+    try:
+        shot = simulate_shot(small_scanner(40), EYE, bodies, [("x", s["periods"], 3)], photometry)
+    except InputError:
+        # An oval of more than a tenth of the radius is refused too.
+        assert broken or abs(s["ovality"]) > 0.1 * s["radius"]
+        return
+    assert shot.frames[0][0].shape == (24, 32)
+    lit = np.isfinite(shot.column_px)
+    assert (shot.labels[lit] > 0).all() and np.isfinite(shot.points_mm[lit]).all()
 
 
 # --- end to end: a decoder in NumPy and OpenCV that shares nothing with the simulator

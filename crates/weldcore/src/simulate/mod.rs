@@ -35,6 +35,8 @@ const BAND: usize = 8;
 const LIFT_MM: f64 = 1e-3;
 /// Harmonics kept of a pattern with a gamma; the next is below 1e-5 of full scale for gammas of 0.5 to 4.
 const HARMONICS: usize = 32;
+/// More frames than that are a mistake, and would not fit into the memory.
+const MOST_FRAMES: usize = 2048;
 /// Neighbours whose depths differ by more than this share of the depth lie on different surfaces.
 const EDGE: f64 = 0.004;
 
@@ -266,6 +268,11 @@ fn check(bodies: &[Body], fringes: &[FringeSet], exposures: &[f64], photometry: 
         }
     }
     exposures.iter().try_for_each(|&e| require_positive("exposures", e))?;
+    let frames = exposures.len() * (1 + fringes.iter().map(|f| f.steps).sum::<usize>());
+    if frames > MOST_FRAMES {
+        let expected = format!("at most {MOST_FRAMES}");
+        return Err(Error::OutOfRange { what: "frames of a shot", expected, value: frames.to_string() });
+    }
     let p = photometry;
     require_positive("distance_mm", p.distance_mm)?;
     require_positive("full_well_e", p.full_well_e)?;

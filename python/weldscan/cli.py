@@ -65,8 +65,6 @@ calibrate = typer.Typer(
 )
 app.add_typer(calibrate, name="calibrate")
 
-register(app)
-
 SessionFolder = Annotated[
     Path, typer.Argument(metavar="SESSION", help="A folder with session.json and shots/ (weldscan-session/1).")
 ]
@@ -263,6 +261,9 @@ def _progress() -> Iterator[Progress]:
             bars.update(bar, completed=done, total=total, description=what)
 
         yield show
+
+
+register(app, _progress)
 
 
 def main() -> None:

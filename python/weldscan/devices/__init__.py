@@ -18,11 +18,23 @@ BACKENDS = {
         "rsi": "rsi:RsiController",
         "serial": "serial:SerialController",
     },
+    "camera": {
+        "opencv": "opencv:OpenCvCamera",
+        "aravis": "aravis:AravisCamera",
+        "pylon": "pylon:PylonCamera",
+        "folder": "folder:FolderCamera",
+        "simulated": "virtual:VirtualCamera",
+    },
+    "projector": {
+        "window": "window:WindowProjector",
+        "files": "folder:FolderProjector",
+        "simulated": "virtual:VirtualProjector",
+    },
 }
 
 
 def backend(kind: str, name: str) -> Any:
-    """Return the class of a backend. Each takes its own `Settings`; a controller takes an arm.
+    """Return the class of a backend. A device takes its own `Settings`, a controller takes an arm.
 
     >>> backend("robot", "kvp").__name__
     'KvpRobot'

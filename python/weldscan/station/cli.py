@@ -11,6 +11,8 @@ import math
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,21 +25,43 @@ from weldscan.pose import KukaPose
 if TYPE_CHECKING:
     from weldscan.devices.controller import Controller
     from weldscan.devices.robot import Robot, StampedPose
+    from weldscan.session import ShotSpec
 
-robot_app = typer.Typer(
-    help="Where the flange is, and - where allowed - where it shall go.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    add_completion=False,
-)
+
+def _group(about: str) -> typer.Typer:
+    return typer.Typer(help=about, no_args_is_help=True, rich_markup_mode=None, add_completion=False)
+
+
+robot_app = _group("Where the flange is, and - where allowed - where it shall go.")
+camera_app = _group("Which cameras there are, and what they see.")
+devices_app = _group("Camera and projector together.")
 
 Config = Annotated[Path, typer.Option("--config", help="The cell's configuration.")]
 CELL = Path("cell.toml")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of the live cell."""
+Tell = Callable[[int, int, str], None]
+Progress = Callable[[], AbstractContextManager[Tell]]
+
+
+@contextmanager
+def _silent() -> Iterator[Tell]:
+    yield lambda done, of, what: None
+
+
+_progress: Progress = _silent
+NOT_MEASURED, INTERRUPTED = 5, 130
+
+
+def register(app: typer.Typer, progress: Progress = _silent) -> None:
+    """Add the commands of the live cell; `progress` gives what shows how far a scan is."""
+    global _progress  # noqa: PLW0603 - set once, when the command line is put together
+    _progress = progress
     app.add_typer(robot_app, name="robot")
+    app.add_typer(camera_app, name="camera")
+    app.add_typer(devices_app, name="devices")
+    app.command()(project)
+    app.command(epilog="Example: weldscan scan --config cell.toml --out pipe-17")(scan)
 
 
 @robot_app.command("pose")
@@ -108,6 +132,137 @@ def robot_simulate(
         threading.Thread(target=_obey_lines, args=(controller,), daemon=True).start()
         with contextlib.suppress(KeyboardInterrupt):
             threading.Event().wait()
+
+
+@camera_app.command("list")
+def camera_list() -> None:
+    """List the cameras that each backend sees."""
+    from weldscan.errors import DeviceError
+
+    for name in BACKENDS["camera"]:
+        try:
+            found = backend("camera", name).available()
+        except DeviceError as error:
+            print(f"{name:10} {error}")
+        else:
+            print(f"{name:10} {', '.join(found) or '-'}")
+
+
+@camera_app.command("preview")
+def camera_preview(
+    config: Config = CELL,
+    out: Annotated[Path, typer.Option(help="The picture: saturated pixels red, dark ones blue.")] = Path("preview.png"),
+    count: Annotated[int, typer.Option(min=0, help="How many frames; 0: until Ctrl-C.")] = 0,
+) -> None:
+    """Look through the camera: a picture that is written again and again, and the shares of useless pixels."""
+    import cv2
+
+    from weldscan.station.capture import full_scale
+    from weldscan.station.cell import read_cell
+    from weldscan.station.check import LEAST_CONTRAST, overlay
+
+    done = 0
+    with read_cell(config).open("camera") as camera, contextlib.suppress(KeyboardInterrupt):
+        while count == 0 or done < count:
+            frame = camera.capture()
+            top = full_scale(frame.image)
+            fresh = out.with_name(f".{out.name}.new.png")
+            cv2.imwrite(str(fresh), overlay(frame.image))
+            fresh.replace(out)
+            saturated, dark = (frame.image >= top).mean(), (frame.image <= LEAST_CONTRAST * top).mean()
+            print(
+                f"{frame.image.shape[1]}x{frame.image.shape[0]}, {camera.exposure_s * 1000:g} ms: "
+                f"saturated {saturated:.2%}, dark {dark:.2%}",
+                flush=True,
+            )
+            done += 1
+
+
+def project(
+    config: Config = CELL,
+    pattern: Annotated[str, typer.Option(help="white, black, a grey level, or all: the plan's fringes.")] = "white",
+    hold: Annotated[float, typer.Option(min=0.0, help="Seconds for each pattern; 0: until Ctrl-C.")] = 0.0,
+) -> None:
+    """Show a pattern on the projector."""
+    from weldscan.fringes import flat_pattern, fringe_patterns
+    from weldscan.station.cell import read_cell
+    from weldscan.station.scan import read_settings
+
+    cell = read_cell(config)
+    with cell.open("projector") as projector, contextlib.suppress(KeyboardInterrupt):
+        size = projector.settings.width, projector.settings.height
+        levels = {"white": 255, "black": 0}
+        if pattern == "all":
+            _, plan = read_settings(cell)
+            patterns = list(fringe_patterns([(f.axis, f.periods, f.steps) for f in plan.fringes], *size))
+        elif pattern in levels or (pattern.isdigit() and int(pattern) <= 255):
+            patterns = [flat_pattern(levels.get(pattern, int(pattern) if pattern.isdigit() else 0), *size)]
+        else:
+            raise InputError(f"--pattern: {pattern!r} is not white, black, all or a level from 0 to 255")
+        for image in patterns:
+            projector.show(image)
+            time.sleep(hold if hold > 0 else 86_400)
+
+
+@devices_app.command("check")
+def devices_check(
+    config: Config = CELL,
+    out: Annotated[Path, typer.Option(help="Where the response table goes.")] = Path("response.json"),
+) -> None:
+    """Measure latency, response, saturated and dark pixels of projector and camera."""
+    from weldscan.manifest import replace_durably, to_bytes
+    from weldscan.station import check
+    from weldscan.station.cell import read_cell
+
+    cell = read_cell(config)
+    with cell.open("projector") as projector, cell.open("camera") as camera:
+        exposure_s = check.prepare(camera, projector)
+        print(f"exposure   {exposure_s * 1000:.3f} ms, {exposure_s * projector.settings.refresh_hz:.0f} refreshes")
+        seconds = check.latency_s(camera, projector)
+        print(f"latency    {max(seconds) * 1000:.1f} ms at most of {len(seconds)}: latency_s = {max(seconds):.3f}")
+        shares = check.pixels(camera, projector)
+        print(f"pixels     saturated {shares.saturated:.2%}, dark {shares.dark:.2%}")
+        table = check.response(camera, projector)
+        replace_durably(out, to_bytes(table))
+        print(f'response   gamma {check.gamma(table):.3f}; [projector] response = "{out}" corrects it')
+
+
+def scan(
+    out: Annotated[Path, typer.Option(help="The session folder: new, or with --resume one that was begun.")],
+    config: Config = CELL,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a scan that was stopped.")] = False,
+) -> None:
+    """Scan what the cell's plan says, into a session folder that `weldscan inspect` reads."""
+    import signal
+
+    from weldscan.station.cell import read_cell
+    from weldscan.station.scan import scan as run
+
+    def stop(_number: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, stop)
+    how = f"weldscan scan --config {config} --out {out} --resume"
+    try:
+        with _progress() as tell:
+            result = run(read_cell(config), out, resume, tell, _ask_the_operator)
+    except KeyboardInterrupt:
+        print(f"weldscan: stopped; what was kept is whole. To go on: {how}", file=sys.stderr)
+        raise typer.Exit(INTERRUPTED) from None
+    print(f"{result.whole} of {result.planned} shots in {out}")
+    for name, reason in result.rejected:
+        print(f"       rejected {name}: {reason}")
+    if result.whole < result.planned:
+        print(f"       to go on: {how}")
+        raise typer.Exit(NOT_MEASURED)
+    print(f"       next: weldscan inspect {out}")
+
+
+def _ask_the_operator(shot: ShotSpec) -> None:
+    target = "" if shot.flange_pose is None else f" ({shot.flange_pose})"
+    print(f"Move the flange to {shot.name}{target}, then press Enter.", file=sys.stderr, flush=True)
+    if not sys.stdin.readline():
+        raise InputError(f"{shot.name}: nobody is there to say that the robot is at its pose")
 
 
 def _robot(config: Path) -> Robot:

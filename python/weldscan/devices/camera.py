@@ -1,0 +1,119 @@
+"""One face for every camera: an exposure that began after the question, whole and of the right size, or a typed
+error.
+"""
+
+from __future__ import annotations
+
+import abc
+import time
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from weldscan.errors import DeviceError, DeviceTimeout
+
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+EXPOSURE_TOLERANCE = 0.02
+"""How far the exposure that was read back may be from the wanted one; cameras count lines or microseconds."""
+
+
+class TornFrame(DeviceError):
+    """Parts of a frame were lost on their way; another exposure may be better."""
+
+
+class CameraSettings(BaseModel):
+    """What every camera's section of a cell's configuration has."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+    exposure_s: Annotated[float, Field(gt=0, le=60)] = 1 / 30
+    timeout_s: Annotated[float, Field(gt=0, le=600)] = 2.0
+    """For one frame, on top of its exposure, retries included."""
+    retries: Annotated[int, Field(ge=0, le=100)] = 10
+    """Further exposures after a torn frame."""
+    trigger: Literal["software", "hardware"] = "software"
+    """hardware: the camera exposes on its trigger input, which the projector drives; a question waits for that."""
+    width: Annotated[int, Field(ge=1)] | None = None
+    height: Annotated[int, Field(ge=1)] | None = None
+    """The size that every frame must have; absent: that of the first frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One exposure."""
+
+    image: Image
+    """(height, width), grey."""
+    time_s: float
+    """When it was there, on this computer's monotonic clock."""
+    retries: int
+    """Torn frames before it."""
+
+
+class Camera(abc.ABC):
+    """A camera whose exposure, gain and offset stay what they were set to."""
+
+    Settings: ClassVar[type[CameraSettings]] = CameraSettings
+    settings: CameraSettings
+    name: str
+    exposure_s: float = 0.0
+    _size: tuple[int, int] | None = None
+
+    @classmethod
+    def available(cls) -> list[str]:
+        """Return the names of the cameras that this backend sees."""
+        return []
+
+    @abc.abstractmethod
+    def _set_exposure(self, exposure_s: float) -> float:
+        """Set it, and return what the camera then says it is."""
+
+    @abc.abstractmethod
+    def _grab(self, deadline_s: float) -> NDArray[Any]:
+        """Return one exposure that began after the call; `TornFrame` where parts of it are missing."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Let go of the camera."""
+
+    def set_exposure(self, exposure_s: float) -> float:
+        """Set the exposure time and return what was read back. Raises `DeviceError` where the camera does otherwise."""
+        actual = self._set_exposure(exposure_s)
+        if not abs(actual - exposure_s) <= EXPOSURE_TOLERANCE * exposure_s:
+            raise DeviceError(f"{self.name}: exposure is {actual * 1000:g} ms, not {exposure_s * 1000:g} ms")
+        self.exposure_s = actual
+        return actual
+
+    def capture(self) -> Frame:
+        """Return one whole frame whose exposure began after the call."""
+        give_up_s = time.monotonic() + self.settings.timeout_s + self.exposure_s
+        for attempt in range(self.settings.retries + 1):
+            try:
+                image = self._checked(self._grab(give_up_s))
+                return Frame(image, time.monotonic(), attempt)
+            except TornFrame as error:
+                if time.monotonic() > give_up_s:
+                    raise DeviceTimeout(f"{self.name}: only torn frames, {attempt + 1} of them") from error
+        raise DeviceError(f"{self.name}: {self.settings.retries + 1} torn frames in a row")
+
+    def _checked(self, image: NDArray[Any]) -> Image:
+        if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16) or 0 in image.shape:
+            raise DeviceError(f"{self.name}: a frame {image.shape} {image.dtype} is no grey image")
+        size = image.shape[1], image.shape[0]
+        wanted = self._size or (self.settings.width or size[0], self.settings.height or size[1])
+        if size != wanted:
+            raise DeviceError(f"{self.name}: a frame of {size[0]}x{size[1]}, not {wanted[0]}x{wanted[1]} pixels")
+        self._size = size
+        return image
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,141 @@
+"""The simulated cell as devices: a camera that sees what the simulated projector shows, from where the robot stands.
+
+Camera and projector are two halves of one scanner, so they share what is shown (`_SHOWN`). Where the scanner is, the
+camera asks the simulated controller, as it would be known to the light: `controller` is a robot link of its own.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import zlib
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError
+
+from weldscan.devices import BACKENDS, backend
+from weldscan.devices.camera import Camera, CameraSettings
+from weldscan.devices.projector import Projector, ProjectorSettings
+from weldscan.devices.simulated import DEFAULT, Cell, render
+from weldscan.errors import DeviceError, InputError
+from weldscan.fringes import fringe_patterns
+
+_SHOWN: dict[str, NDArray[np.uint8]] = {}
+"""The one projector of the one simulated cell of this process."""
+
+
+class VirtualProjectorSettings(ProjectorSettings):
+    """`[projector]` with `backend = "simulated"`."""
+
+    backend: Literal["simulated"] = "simulated"
+    latency_s: Annotated[float, Field(ge=0, le=10)] = 0.0
+    guard_frames: Annotated[int, Field(ge=0, le=100)] = 0
+
+
+class VirtualProjector(Projector):
+    """Light in the simulated cell."""
+
+    Settings = VirtualProjectorSettings
+    settings: VirtualProjectorSettings
+
+    def __init__(self, settings: VirtualProjectorSettings) -> None:
+        self.settings = settings
+        self.name = "simulated projector"
+
+    def close(self) -> None:
+        """Switch it off."""
+        _SHOWN.clear()
+
+    def _show(self, image: NDArray[np.uint8]) -> float:
+        _SHOWN["image"] = image
+        return time.monotonic()
+
+
+class VirtualCameraSettings(CameraSettings):
+    """`[camera]` with `backend = "simulated"`."""
+
+    backend: Literal["simulated"] = "simulated"
+    controller: dict[str, Any] = Field(default_factory=dict)
+    """A robot section: the simulated controller that carries this camera; empty: it stands at the first part pose."""
+    nominal_exposure_s: Annotated[float, Field(gt=0)] = 1 / 30
+    """The exposure that the simulated cell is lit for."""
+
+
+class VirtualCamera(Camera):
+    """A camera in the simulated cell (`weldscan.devices.simulated.DEFAULT`)."""
+
+    Settings = VirtualCameraSettings
+    settings: VirtualCameraSettings
+
+    def __init__(self, settings: VirtualCameraSettings, cell: Cell = DEFAULT) -> None:
+        self.settings, self.cell = settings, cell
+        self.name = "simulated camera"
+        self._patterns = list(
+            fringe_patterns(cell.fringes, cell.scanner.projector.width, cell.scanner.projector.height)
+        )
+        self._robot: Any = None
+        if settings.controller:
+            link = settings.controller.get("link")
+            if link not in BACKENDS["robot"]:
+                raise InputError(f"camera.controller.link: {link!r} is none of {', '.join(BACKENDS['robot'])}")
+            robot = backend("robot", link)
+            try:
+                self._robot = robot(robot.Settings.model_validate(settings.controller))
+            except ValidationError as error:
+                raise InputError(f"camera.controller: {error.errors()[0]['loc']}: {error.errors()[0]['msg']}") from None
+        self._seen: tuple[Any, ...] = ()
+        self._rendered: Any = None
+        self.set_exposure(settings.exposure_s)
+
+    def close(self) -> None:
+        """Let go of the controller."""
+        if self._robot is not None:
+            self._robot.close()
+
+    def _set_exposure(self, exposure_s: float) -> float:
+        return exposure_s
+
+    def _grab(self, deadline_s: float) -> NDArray[Any]:
+        shown = _SHOWN.get("image")
+        lens = self.cell.scanner.camera
+        if shown is None:
+            return np.zeros((lens.height, lens.width), np.uint8)
+        shot = self._render()
+        for index, pattern in enumerate(self._patterns):
+            if shown.shape == pattern.shape and np.array_equal(shown, pattern):
+                image: NDArray[Any] = shot.frames[0][index]
+                return image
+        level = int(shown.flat[0])
+        if not (shown == level).all():
+            raise DeviceError(f"{self.name}: the simulated cell knows its own fringes and even light, nothing else")
+        white = shot.white[0]
+        return np.asarray(white if level == 255 else np.rint(white * (level / 255.0)), dtype=white.dtype)
+
+    def _render(self) -> Any:
+        """Render all patterns from here at this exposure at once, and keep them while nothing moves."""
+        cell = self.cell
+        if self._robot is None:
+            base_from_scanner = cell.part_views()[0]
+        else:
+            base_from_scanner = self._robot.pose().flange.matrix() @ np.asarray(cell.flange_from_scanner)
+        seen = (base_from_scanner.round(6).tobytes(), self.exposure_s)
+        if seen != self._seen:
+            relative = self.exposure_s / self.settings.nominal_exposure_s
+            seed = zlib.crc32(seen[0], cell.seed)
+            self._rendered = render(
+                cell, self._in_view(base_from_scanner), base_from_scanner, exposures=[relative], seed=seed
+            )
+            self._seen = seen
+        return self._rendered
+
+    def _in_view(self, base_from_scanner: NDArray[np.float64]) -> Literal["artefact", "part"]:
+        """Which of the two stands nearer to where the scanner looks."""
+        looked_at = (base_from_scanner @ [0.0, 0.0, self.cell.distance_mm, 1.0])[:3]
+        plate = np.asarray(self.cell.base_from_plate)[:3, 3]
+        weld = np.asarray(self.cell.base_from_weld)
+        in_weld = np.linalg.inv(weld) @ [*looked_at, 1.0]
+        radius = self.cell.weld.reference.radius_mm
+        height = in_weld[0] if math.isinf(radius) else math.hypot(in_weld[0], in_weld[1]) - radius
+        return "artefact" if float(np.linalg.norm(looked_at - plate)) < abs(float(height)) else "part"

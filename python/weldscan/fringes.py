@@ -1,0 +1,50 @@
+"""Which patterns a projector shows, in which order: the fringe sets of a session, one image per step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldscan.errors import InputError
+
+Pattern = NDArray[np.uint8]
+
+
+def fringe_patterns(fringes: Iterable[tuple[str, float, int]], width: int, height: int) -> Iterator[Pattern]:
+    """Yield the projector images of fringe sets, in the order of the sets and then of the steps.
+
+    Step i of column u shows 0.5 + 0.5 cos(2 pi (periods (u + 0.5) / width - i / steps)), in 8 bits; along y the same
+    with rows and the height.
+
+    Args:
+        fringes: (axis "x" or "y", periods over the whole width or height, steps) per set.
+        width: of the projector, pixels.
+        height: of the projector, pixels.
+
+    Returns:
+        (height, width) uint8 images, read-only.
+
+    Raises:
+        InputError: an axis that is neither, fewer than 3 steps, periods or a size that are not positive.
+
+    >>> [int(v) for v in next(fringe_patterns([("x", 1, 4)], 4, 1))[0]]
+    [218, 37, 37, 218]
+    """
+    if width < 1 or height < 1:
+        raise InputError(f"projector: {width}x{height} pixels")
+    for axis, periods, steps in fringes:
+        if axis not in ("x", "y") or steps < 3 or not (math.isfinite(periods) and periods > 0):
+            raise InputError(f"fringes: axis {axis!r}, {periods} periods, {steps} steps")
+        size = width if axis == "x" else height
+        turns = periods * (np.arange(size) + 0.5) / size
+        for step in range(steps):
+            level = np.rint(255 * (0.5 + 0.5 * np.cos(2 * np.pi * (turns - step / steps)))).astype(np.uint8)
+            yield np.broadcast_to(level if axis == "x" else level[:, None], (height, width))
+
+
+def flat_pattern(level: int, width: int, height: int) -> Pattern:
+    """Return an even image, (height, width) uint8, read-only: 255 is white."""
+    return np.broadcast_to(np.uint8(level), (height, width))

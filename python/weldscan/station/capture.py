@@ -1,0 +1,87 @@
+"""One stack of images: a pattern, the time it takes to reach the wall, a frame; and whether the stack is good
+enough.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldscan.devices.camera import Camera, Image
+from weldscan.devices.projector import Pattern, Projector, whole_refreshes
+
+Sets = Sequence[tuple[str, float, int]]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What share of the image can be measured, and what spoils the rest."""
+
+    usable: float
+    """Unsaturated and modulated in at least one exposure."""
+    saturated: float
+    """Saturated in every exposure."""
+    dark: float
+    """Neither: too little modulation."""
+    median_modulation: float
+    """Of the usable pixels, in parts of full scale."""
+
+
+def set_exposure(camera: Camera, projector: Projector, exposure_s: float) -> float:
+    """Set an exposure of a whole number of refreshes."""
+    return camera.set_exposure(whole_refreshes(exposure_s, projector.settings.refresh_hz))
+
+
+def capture_stack(
+    camera: Camera, projector: Projector, patterns: Iterable[Pattern], each: Callable[[], None] = lambda: None
+) -> list[Image]:
+    """Show each pattern, wait until it is surely on the wall, take one frame of it."""
+    images = []
+    for pattern in patterns:
+        projector.show(pattern)
+        time.sleep(projector.settle_s)
+        images.append(camera.capture().image)
+        each()
+    return images
+
+
+def full_scale(image: Image) -> int:
+    """Return the largest value that this kind of image can have."""
+    return int(np.iinfo(image.dtype).max)
+
+
+def judge(stacks: Sequence[Sequence[Image]], fringes: Sets, least_modulation: float) -> Quality:
+    """Return the quality of a shot's exposures, from the finest set of fringes; nothing is decoded.
+
+    Args:
+        stacks: exposures x frames, in the order of the fringes.
+        fringes: (axis, periods, steps) of each set.
+        least_modulation: in parts of full scale: below it a pixel counts as dark.
+    """
+    finest = max(range(len(fringes)), key=lambda k: fringes[k][1])
+    start, steps = sum(n for _, _, n in fringes[:finest]), fringes[finest][2]
+    shape = stacks[0][0].shape
+    best: NDArray[np.float32] = np.zeros(shape, np.float32)
+    unsaturated = np.zeros(shape, bool)
+    phase = 2 * np.pi * np.arange(steps) / steps
+    for stack in stacks:
+        top = full_scale(stack[0])
+        whole = np.maximum.reduce(stack) < top
+        cosine, sine = (
+            np.tensordot(weights.astype(np.float32), np.asarray(stack[start : start + steps], np.float32), 1)
+            for weights in (np.cos(phase), np.sin(phase))
+        )
+        modulation = np.hypot(cosine, sine) * np.float32(2 / steps / top)
+        best = np.where(whole, np.maximum(best, modulation), best)
+        unsaturated |= whole
+    usable = unsaturated & (best >= least_modulation)
+    return Quality(
+        usable=float(usable.mean()),
+        saturated=float((~unsaturated).mean()),
+        dark=float((unsaturated & ~usable).mean()),
+        median_modulation=float(np.median(best[usable])) if usable.any() else 0.0,
+    )

@@ -1,0 +1,121 @@
+"""`weldscan devices check`: what cannot be looked up is measured - latency, response, and where the image is of no
+use.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldscan.devices.camera import Camera, Image
+from weldscan.devices.projector import Projector
+from weldscan.errors import DeviceError, DeviceTimeout
+from weldscan.fringes import flat_pattern
+from weldscan.station.capture import full_scale, set_exposure
+
+LONGEST_LATENCY_S = 2.0
+REST_S = 0.3
+"""Before each ramp, on top of the configured latency, which may be wrong."""
+ARRIVED = 0.95
+"""Of the way from black to white: a frame that began before the switch has less."""
+LEAST_CONTRAST = 0.05
+"""Of full scale: below it the camera does not see the projector."""
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Shares of the camera's image."""
+
+    saturated: float
+    """At full scale in white."""
+    dark: float
+    """Hardly brighter in white than in black."""
+
+
+def latency_s(camera: Camera, projector: Projector, repeats: int = 5) -> tuple[float, ...]:
+    """Return, per repeat, seconds from `show` until a frame began that shows nothing of the pattern before."""
+    black, white = _flats(camera, projector)
+    low, high = float(black.mean()), float(white.mean())
+    if high - low < LEAST_CONTRAST * full_scale(white):
+        raise DeviceError(f"{camera.name} does not see {projector.name}: black {low:.1f}, white {high:.1f}")
+    found = []
+    for _ in range(repeats):
+        _show(projector, 0, REST_S)
+        shown_s = projector.show(_flat(projector, 255))
+        while True:
+            began_s = time.monotonic()
+            if began_s - shown_s > LONGEST_LATENCY_S:
+                raise DeviceTimeout(f"{projector.name}: no white within {LONGEST_LATENCY_S:g} s")
+            if camera.capture().image.mean() >= low + ARRIVED * (high - low):
+                found.append(began_s - shown_s)
+                break
+    return tuple(found)
+
+
+def response(camera: Camera, projector: Projector, levels: int = 18, frames: int = 3) -> dict[str, Any]:
+    """Return a `weldscan-response/1` document: the light that the camera sees at levels from 0 to 255."""
+    black, white = _flats(camera, projector)
+    top = full_scale(white)
+    lit = (white < top) & (white.astype(np.int64) - black > LEAST_CONTRAST * top)
+    if not lit.any():
+        raise DeviceError(f"{camera.name}: no pixel is lit and unsaturated; change the exposure")
+    shown = np.unique(np.rint(np.linspace(0, 255, levels)).astype(int))
+    light = []
+    for level in shown:
+        _show(projector, int(level))
+        light.append(float(np.mean([camera.capture().image[lit].mean() for _ in range(frames)])))
+    return {"schema": "weldscan-response/1", "level": shown.tolist(), "light": light}
+
+
+def gamma(document: dict[str, Any]) -> float:
+    """Return the exponent of the power law that fits a response best: 1 is linear."""
+    level, light = (np.asarray(document[key], float) for key in ("level", "light"))
+    x, y = level / 255, (light - light[0]) / (light[-1] - light[0])
+    used = (x > 0.05) & (x < 1) & (y > 0.01)
+    return float(np.sum(np.log(x[used]) * np.log(y[used])) / np.sum(np.log(x[used]) ** 2))
+
+
+def pixels(camera: Camera, projector: Projector) -> Pixels:
+    """Return which share of the image is saturated or dark."""
+    black, white = _flats(camera, projector)
+    top = full_scale(white)
+    return Pixels(
+        saturated=float((white >= top).mean()),
+        dark=float((white.astype(np.int64) - black <= LEAST_CONTRAST * top).mean()),
+    )
+
+
+def overlay(image: Image, least: float = LEAST_CONTRAST) -> NDArray[np.uint8]:
+    """Return a BGR picture for the operator: saturated pixels red, dark ones blue."""
+    top = full_scale(image)
+    grey = (image // (top // 255)).astype(np.uint8)
+    picture = np.repeat(grey[:, :, None], 3, axis=2)
+    picture[image >= top] = (0, 0, 255)
+    picture[image <= least * top] = (160, 0, 0)
+    return picture
+
+
+def prepare(camera: Camera, projector: Projector) -> float:
+    """Set the camera's exposure to a whole number of refreshes and return it."""
+    return set_exposure(camera, projector, camera.settings.exposure_s)
+
+
+def _flat(projector: Projector, level: int) -> NDArray[np.uint8]:
+    return flat_pattern(level, projector.settings.width, projector.settings.height)
+
+
+def _show(projector: Projector, level: int, rest_s: float = 0.0) -> None:
+    projector.show(_flat(projector, level))
+    time.sleep(projector.settle_s + rest_s)
+
+
+def _flats(camera: Camera, projector: Projector) -> tuple[Image, Image]:
+    images = []
+    for level in (0, 255):
+        _show(projector, level, REST_S)
+        images.append(camera.capture().image)
+    return images[0], images[1]

@@ -1,0 +1,266 @@
+"""`weldscan scan`: goes through a plan, shot by shot, and leaves a session folder that `weldscan inspect` reads.
+
+At each pose: move, or wait for the operator; wait until the robot stands; read the pose, take the images, read the pose
+again - a robot that moved rejects the shot; look at the quality, once more with another exposure where that helps; keep
+the shot.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from weldscan.devices.camera import Camera, Image
+from weldscan.devices.projector import Projector
+from weldscan.devices.robot import Robot, StampedPose, distance, wait_until_still
+from weldscan.errors import InputError, WeldscanError
+from weldscan.fringes import flat_pattern, fringe_patterns
+from weldscan.manifest import read_plan
+from weldscan.pose import KukaPose
+from weldscan.session import FlangePose, Session, ShotSpec, read_hand_eye
+from weldscan.station.capture import Quality, capture_stack, judge, set_exposure
+from weldscan.station.cell import CellConfig, check
+from weldscan.station.store import LOG, ShotStore
+
+Tell = Callable[[int, int, str], None]
+Operator = Callable[[ShotSpec], None]
+Share = Annotated[float, Field(ge=0, le=1)]
+EXPOSURE_STEP = 2.0
+"""The one other exposure: half where too much is saturated, twice where too little can be measured."""
+MOVED_ATTEMPTS = 2
+
+log = logging.getLogger("weldscan.scan")
+
+
+class ScanSettings(BaseModel):
+    """`[scan]`. Lengths of pose differences are those of the flange."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+    plan: Path
+    """A `weldscan-session/1` document: its shots, with the poses where the flange shall go."""
+    still_window_s: Annotated[float, Field(gt=0, le=60)] = 0.3
+    still_mm: Annotated[float, Field(gt=0)] = 0.02
+    """Standing, and not moved during the images: two thirds of the repeatability of a small KUKA."""
+    still_deg: Annotated[float, Field(gt=0)] = 0.003
+    still_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
+    most_saturated: Share = 0.05
+    least_usable: Share = 0.02
+    """Of the image: a plate with three spheres in front of nothing is about 5 %."""
+    least_modulation: Share = 0.02
+    """5 of 255 grey levels: below it 4 steps give the phase no better than 0.2 rad, with a noise of 1.5 levels."""
+
+
+@dataclass(frozen=True)
+class ScanResult:
+    """What came of it."""
+
+    folder: Path
+    whole: int
+    planned: int
+    rejected: tuple[tuple[str, str], ...]
+    """Shots that were tried and not kept, with the reason."""
+
+
+class Rejected(WeldscanError):
+    """A shot that must not count."""
+
+
+def scan(
+    cell: CellConfig,
+    out: Path,
+    resume: bool = False,
+    tell: Tell = lambda done, of, what: None,
+    operator: Operator | None = None,
+) -> ScanResult:
+    """Scan what the plan says and is not there yet.
+
+    Args:
+        cell: which devices, which plan.
+        out: the session folder; new, or with `resume` one that an earlier scan of the same plan began.
+        resume: go on with that.
+        tell: called with (whole shots, planned shots, what is being done).
+        operator: called before a shot when weldscan may not move the robot; returns when the robot is at its pose.
+
+    Raises:
+        InputError: configuration, plan or folder. DeviceError: a device failed; the shots so far are kept.
+    """
+    settings, plan = read_settings(cell)
+    with ShotStore(out, plan, resume) as store, _log_to(out / LOG), ExitStack() as devices:
+        log.info("scan of %d shots, %d are there", len(plan.shots), len(store.whole))
+        for name, reason in store.redone.items():
+            log.warning("%s is taken again: %s", name, reason)
+        if not store.missing:
+            return ScanResult(out, len(store.whole), len(plan.shots), ())
+        try:
+            projector: Projector = devices.enter_context(cell.open("projector"))
+            camera: Camera = devices.enter_context(cell.open("camera"))
+            robot: Robot | None = devices.enter_context(cell.open_robot()) if plan.has_robot else None
+            return _Scan(settings, plan, store, projector, camera, robot, tell, operator).run()
+        except BaseException as error:
+            log.error(
+                "stopped with %d of %d shots: %s", len(store.whole), len(plan.shots), error or type(error).__name__
+            )
+            raise
+
+
+class _Scan:
+    """One run: what every step needs."""
+
+    def __init__(
+        self,
+        settings: ScanSettings,
+        plan: Session,
+        store: ShotStore,
+        projector: Projector,
+        camera: Camera,
+        robot: Robot | None,
+        tell: Tell,
+        operator: Operator | None,
+    ) -> None:
+        self.settings, self.plan, self.store = settings, plan, store
+        self.projector, self.camera, self.robot = projector, camera, robot
+        self.tell, self.operator = tell, operator
+        lens, size = plan.scanner.projector, (projector.settings.width, projector.settings.height)
+        if size != (lens.width, lens.height):
+            raise InputError(f"projector: {size[0]}x{size[1]}, but the plan's has {lens.width}x{lens.height} pixels")
+        self.sets = [(fringe.axis, fringe.periods, fringe.steps) for fringe in plan.fringes]
+        self.patterns = [*fringe_patterns(self.sets, *size), flat_pattern(255, *size)]
+
+    def run(self) -> ScanResult:
+        rejected = []
+        for shot in self.store.missing:
+            try:
+                self._take(shot)
+            except Rejected as error:
+                log.warning("%s rejected: %s", shot.name, error)
+                rejected.append((shot.name, str(error)))
+                self._say(f"rejected {shot.name}: {error}")
+            else:
+                log.info("kept %s", shot.name)
+                self._say(f"kept {shot.name}")
+        return ScanResult(self.store.folder, len(self.store.whole), len(self.plan.shots), tuple(rejected))
+
+    def _say(self, what: str) -> None:
+        self.tell(len(self.store.whole), len(self.plan.shots), what)
+
+    def _take(self, shot: ShotSpec) -> None:
+        self._say(f"going to {shot.name}")
+        self._go(shot)
+        factor = 1.0
+        for attempt in range(2):
+            stacks, whites, exposures, record = self._images(shot, factor)
+            quality = judge(stacks, self.sets, self.settings.least_modulation)
+            log.info("%s: %s", shot.name, quality)
+            complaint, better = self._complaint(quality)
+            if complaint is None:
+                break
+            if attempt == 1:
+                raise Rejected(complaint)
+            log.info("%s: %s; once more with %g times the exposure", shot.name, complaint, better)
+            factor = better
+        pose = record.pop("pose")
+        taken = shot.model_copy(update={"exposures": exposures, "flange_pose": pose})
+        self.store.keep(taken, stacks, whites, {**record, "quality": asdict(quality)})
+
+    def _go(self, shot: ShotSpec) -> None:
+        if self.robot is None or not self.robot.settings.allow_motion:
+            if self.operator is not None:
+                self.operator(shot)
+        elif shot.flange_pose is not None:
+            self.robot.move_to(KukaPose(*shot.flange_pose.model_dump().values()))
+
+    def _images(
+        self, shot: ShotSpec, factor: float
+    ) -> tuple[list[list[Image]], list[Image], tuple[float, ...] | None, dict[str, Any]]:
+        """All exposures of a shot, from a robot that stood all the while."""
+        relative = shot.exposures or (1.0,)
+        for attempt in range(MOVED_ATTEMPTS):
+            if attempt > 0:
+                self._go(shot)
+            before = self._standing()
+            self._say(f"taking {shot.name}")
+            started = time.strftime("%Y-%m-%dT%H:%M:%S%z")
+            stacks, whites, actual = [], [], []
+            for exposure in relative:
+                wanted_s = self.camera.settings.exposure_s * exposure * factor
+                actual.append(set_exposure(self.camera, self.projector, wanted_s))
+                *frames, white = capture_stack(self.camera, self.projector, self.patterns)
+                stacks.append(frames)
+                whites.append(white)
+            if len(set(actual)) < len(actual):
+                raise InputError(f"{shot.name}: exposures: {relative} are not whole refreshes apart")
+            after = None if self.robot is None else self.robot.pose()
+            record: dict[str, Any] = {"started": started, "exposures_s": actual}
+            if before is None or after is None:
+                return stacks, whites, self._ratios(shot, actual), {**record, "pose": None}
+            moved_mm, moved_deg = distance(before.flange, after.flange)
+            if moved_mm <= self.settings.still_mm and moved_deg <= self.settings.still_deg:
+                record |= {"moved_mm": moved_mm, "moved_deg": moved_deg}
+                return stacks, whites, self._ratios(shot, actual), {**record, "pose": _flange_pose(before)}
+            log.warning("%s: the robot moved by %.3f mm, %.4f degrees meanwhile", shot.name, moved_mm, moved_deg)
+        raise Rejected(f"the robot moved by {moved_mm:.3f} mm and {moved_deg:.4f} degrees during the images")
+
+    def _ratios(self, shot: ShotSpec, actual_s: list[float]) -> tuple[float, ...] | None:
+        """The exposures as they were, relative to the cell's."""
+        if shot.exposures is None:
+            return None
+        return tuple(round(exposure / self.camera.settings.exposure_s, 6) for exposure in actual_s)
+
+    def _standing(self) -> StampedPose | None:
+        if self.robot is None:
+            return None
+        s = self.settings
+        wait_until_still(self.robot, s.still_window_s, s.still_mm, s.still_deg, s.still_timeout_s)
+        return self.robot.pose()
+
+    def _complaint(self, quality: Quality) -> tuple[str | None, float]:
+        """What is wrong with a shot, and the exposure that may help."""
+        if quality.saturated > self.settings.most_saturated:
+            return f"{quality.saturated:.1%} of the image is saturated", 1 / EXPOSURE_STEP
+        if quality.usable < self.settings.least_usable:
+            return f"only {quality.usable:.1%} of the image can be measured", EXPOSURE_STEP
+        return None, 1.0
+
+
+def _flange_pose(pose: StampedPose) -> FlangePose:
+    x, y, z, a, b, c = (round(value, 6) for value in pose.flange.values())
+    return FlangePose(X=x, Y=y, Z=z, A=a, B=b, C=c)
+
+
+def read_settings(cell: CellConfig) -> tuple[ScanSettings, Session]:
+    """Return a cell's `[scan]` and the plan that it names."""
+    settings = check(cell.scan, ScanSettings, f"{cell.path}: scan")
+    path = cell.path.parent / settings.plan
+    plan = read_plan(path)
+    if isinstance(plan.hand_eye, str):
+        plan = plan.model_copy(update={"hand_eye": read_hand_eye(path.parent / plan.hand_eye)})
+    return settings, plan
+
+
+class _log_to:
+    """One log per session folder."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> None:
+        try:
+            self.handler = logging.FileHandler(self.path, encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+        self.handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        log.addHandler(self.handler)
+        log.setLevel(logging.INFO)
+        log.propagate = False
+
+    def __exit__(self, *_: object) -> None:
+        log.removeHandler(self.handler)
+        self.handler.close()

@@ -1,0 +1,328 @@
+"""One suite for every camera: simulated, a folder, Aravis and pylon against their own simulators, OpenCV on a stand-
+in."""
+
+import shutil
+import subprocess
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from weldscan import DeviceError, DeviceTimeout
+from weldscan.devices import BACKENDS, backend
+from weldscan.devices.camera import Camera, CameraSettings, TornFrame
+
+WIDTH, HEIGHT = 640, 480
+FAKE = "arv-fake-gv-camera-0.8"
+LARGE_PACKETS = 32_000
+"""Aravis's fake camera resends nothing; of its 1,400 byte packets 2 % lost leave no whole image. Loopback takes
+large ones."""
+
+
+def images(count=4):
+    random = np.random.default_rng(7)
+    return [random.integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8) for _ in range(count)]
+
+
+@pytest.fixture
+def scene(tmp_path):
+    for number, image in enumerate(images()):
+        cv2.imwrite(str(tmp_path / f"{number:03d}.png"), image)
+    return tmp_path
+
+
+class V4l2:
+    """What cv2.VideoCapture does with a UVC camera: a stream with a queue, settings that are taken or not."""
+
+    period_s = 0.01
+
+    def __init__(self, device, api):
+        self.values = {cv2.CAP_PROP_AUTO_EXPOSURE: 3.0, cv2.CAP_PROP_FRAME_WIDTH: 0.0}
+        self.opened, self.unplugged, self.refuses = device == 0, False, ()
+        self.seen, self.start_s = 0, time.monotonic()
+        self.size = (HEIGHT, WIDTH)
+
+    def isOpened(self):
+        return self.opened
+
+    def set(self, key, value):
+        if key not in self.refuses:
+            self.values[key] = float(value)
+        return True
+
+    def get(self, key):
+        return self.values.get(key, 0.0)
+
+    def grab(self):
+        """The next frame of the queue of 4, or the one after it when that was read."""
+        newest = int((time.monotonic() - self.start_s) / self.period_s)
+        if self.seen >= newest:
+            time.sleep(self.period_s * (self.seen + 1 - newest))
+            newest = self.seen + 1
+        self.seen = max(self.seen + 1, newest - 3)
+        return not self.unplugged
+
+    def retrieve(self):
+        return True, np.full((*self.size, 3), self.seen % 256, np.uint8)
+
+    def release(self):
+        self.opened = False
+
+
+@pytest.fixture
+def fake_gige():
+    """A factory of Aravis's fake cameras, each in its own process."""
+    if shutil.which(FAKE) is None:
+        pytest.skip(f"{FAKE} (Debian: aravis-tools) is not installed")
+    pytest.importorskip("gi", reason="PyGObject is not installed")
+    running = []
+
+    def start(*options):
+        running.append(subprocess.Popen([FAKE, "-i", "127.0.0.1", "-s", "WELD01", *options], stderr=subprocess.DEVNULL))
+        camera = backend("camera", "aravis")
+        for _ in range(100):
+            found = [name for name in camera.available() if "WELD01" in name]
+            if found:
+                return found[0], running[-1]
+            time.sleep(0.1)
+        pytest.skip("the fake camera does not answer on 127.0.0.1")
+
+    yield start
+    for process in running:
+        process.kill()
+        process.wait()
+
+
+def open_camera(name, scene, request, monkeypatch, **settings):
+    common = {"exposure_s": 0.01, "timeout_s": 3.0, "width": WIDTH, "height": HEIGHT, **settings}
+    if name == "folder":
+        common |= {"folder": scene, "repeat": True}
+    elif name == "aravis":
+        common |= {"device": request.getfixturevalue("fake_gige")()[0]}
+    elif name == "pylon":
+        pytest.importorskip("pypylon", reason="pypylon is not installed")
+        monkeypatch.setenv("PYLON_CAMEMU", "1")
+        common |= {"features": {"ImageFilename": str(scene), "ImageFileMode": "On", "TestImageSelector": "Off"}}
+    elif name == "opencv":
+        monkeypatch.setattr(cv2, "VideoCapture", V4l2)
+    elif name == "simulated":
+        common |= {"width": 1280, "height": 960}
+    camera = backend("camera", name)
+    return camera(camera.Settings(**common))
+
+
+every_camera = pytest.mark.parametrize("name", sorted(BACKENDS["camera"]))
+
+
+@every_camera
+def test_a_camera(name, scene, request, monkeypatch):
+    with open_camera(name, scene, request, monkeypatch) as camera:
+        assert camera.exposure_s == pytest.approx(0.01, rel=0.02)
+        assert camera.set_exposure(0.02) == pytest.approx(0.02, rel=0.02)
+        before = time.monotonic()
+        frames = [camera.capture() for _ in range(3)]
+        assert all(frame.image.shape == ((960, 1280) if name == "simulated" else (HEIGHT, WIDTH)) for frame in frames)
+        assert all(frame.image.dtype == np.uint8 for frame in frames)
+        times = [before, *(frame.time_s for frame in frames), time.monotonic()]
+        assert times == sorted(times)
+        frames[0].image[:] = 0  # a frame is the caller's own: later ones do not see this
+        assert camera.capture().image.shape == frames[1].image.shape
+
+
+@every_camera
+def test_frame_of_the_wrong_size(name, scene, request, monkeypatch):
+    if name in ("aravis", "pylon"):
+        pytest.skip("the size is set on the camera itself")
+    camera = open_camera(name, scene, request, monkeypatch)
+    with camera, pytest.raises(DeviceError, match="320x200"):  # opened with what it has: then the plan wants another
+        object.__setattr__(camera.settings, "width", 320)
+        object.__setattr__(camera.settings, "height", 200)
+        camera.capture()
+
+
+@pytest.mark.parametrize("name", ["folder", "pylon"])
+def test_pixel_exact(name, scene, request, monkeypatch):
+    with open_camera(name, scene, request, monkeypatch) as camera:
+        for image in [*images(), *images()]:
+            np.testing.assert_array_equal(camera.capture().image, image)
+
+
+# --- Aravis against its fake GigE Vision camera -----------------------------------------------------------------------
+
+
+def is_whole(image):
+    """The fake camera draws a diagonal ramp: every row is the one above, moved by one pixel."""
+    return bool((image[1:, :-1] == image[:-1, 1:]).all()) and image.min() < image.max()
+
+
+def test_aravis_200_frames(fake_gige, soak):
+    camera = backend("camera", "aravis")
+    name, _ = fake_gige()
+    with camera(camera.Settings(device=name, width=1280, height=960, exposure_s=0.005, timeout_s=5.0)) as device:
+        count = 200 if soak else 20
+        frames = [device.capture() for _ in range(count)]
+        assert {frame.image.shape for frame in frames} == {(960, 1280)}
+        assert all(is_whole(frame.image) for frame in frames)
+        for exposure_s in (0.003, 0.0125, 0.004):
+            assert device.set_exposure(exposure_s) == pytest.approx(exposure_s, rel=1e-3)
+
+
+def test_aravis_lost_packets_become_retries(fake_gige, soak):
+    camera = backend("camera", "aravis")
+    name, _ = fake_gige("-r", "20")
+    settings = camera.Settings(
+        device=name, width=1280, height=960, exposure_s=0.005, timeout_s=30.0, retries=100, packet_size=LARGE_PACKETS
+    )
+    with camera(settings) as device:
+        frames = [device.capture() for _ in range(200 if soak else 25)]
+        assert sum(frame.retries for frame in frames) > 0
+        assert all(is_whole(frame.image) for frame in frames)
+
+
+def test_aravis_unplugged(fake_gige, soak):
+    if not soak:
+        pytest.skip("takes 15 s, for the library asks the lost camera again and again: --soak")
+    camera = backend("camera", "aravis")
+    name, process = fake_gige()
+    with camera(camera.Settings(device=name, exposure_s=0.005, timeout_s=1.5)) as device:
+        device.capture()
+        process.kill()
+        process.wait()
+        start = time.monotonic()
+        with pytest.raises(DeviceError):
+            for _ in range(5):
+                device.capture()
+        assert time.monotonic() - start < 10.0  # the library itself waits for the lost camera's registers
+
+
+def test_aravis_no_such_camera():
+    pytest.importorskip("gi", reason="PyGObject is not installed")
+    camera = backend("camera", "aravis")
+    with pytest.raises(DeviceError, match="open"):
+        camera(camera.Settings(device="No-Such-Camera"))
+
+
+# --- OpenCV -----------------------------------------------------------------------------------------------------------
+
+
+def test_opencv_gives_no_frame_from_before_the_question(scene, request, monkeypatch):
+    with open_camera("opencv", scene, request, monkeypatch, exposure_s=0.01) as camera:
+        for _ in range(5):
+            time.sleep(0.1)  # the queue fills with frames that nobody asked for
+            asked = (time.monotonic() - camera._capture.start_s) / V4l2.period_s
+            assert camera.capture().image[0, 0] > int(asked) % 256 or asked > 250
+
+
+def test_opencv_settings_that_are_not_taken(monkeypatch):
+    camera = backend("camera", "opencv")
+    for key in (cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_GAIN, cv2.CAP_PROP_FRAME_WIDTH):
+
+        class Stubborn(V4l2):
+            def __init__(self, device, api, key=key):
+                super().__init__(device, api)
+                self.refuses = (key,)
+
+        monkeypatch.setattr(cv2, "VideoCapture", Stubborn)
+        with pytest.raises(DeviceError, match=" is "):
+            camera(camera.Settings(gain=3.0, width=WIDTH, height=HEIGHT))
+
+
+def test_opencv_unplugged(scene, request, monkeypatch):
+    with open_camera("opencv", scene, request, monkeypatch) as camera:
+        camera.capture()
+        camera._capture.unplugged = True
+        with pytest.raises(DeviceError, match="unplugged"):
+            camera.capture()
+
+
+def test_opencv_nothing_there(monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", V4l2)
+    camera = backend("camera", "opencv")
+    with pytest.raises(DeviceError, match="cannot be opened"):
+        camera(camera.Settings(device=5))
+    with pytest.raises(DeviceError, match="hardware trigger"):
+        camera(camera.Settings(trigger="hardware"))
+
+
+# --- the face ---------------------------------------------------------------------------------------------------------
+
+
+class Broken(Camera):
+    """Tears, or gives what is no image."""
+
+    name = "broken"
+
+    def __init__(self, results, **settings):
+        self.settings = CameraSettings(**{"timeout_s": 0.2, "retries": 3, **settings})
+        self.results = iter(results)
+
+    def _set_exposure(self, exposure_s):
+        return exposure_s * 1.5
+
+    def _grab(self, deadline_s):
+        result = next(self.results)
+        if isinstance(result, Exception):
+            raise result
+        return result
+
+    def close(self):
+        pass
+
+
+def test_torn_frames_are_retried_and_never_given():
+    good = np.zeros((4, 6), np.uint8)
+    frame = Broken([TornFrame("x"), TornFrame("x"), good]).capture()
+    assert frame.retries == 2
+    assert frame.image is good
+    with pytest.raises(DeviceError, match="4 torn frames"):
+        Broken([TornFrame("x")] * 9).capture()
+
+
+@pytest.mark.parametrize(
+    "image", [np.zeros((4, 6, 3), np.uint8), np.zeros((4, 6), np.float32), np.zeros((0, 6), np.uint8)]
+)
+def test_no_image(image):
+    with pytest.raises(DeviceError, match="no grey image"):
+        Broken([image]).capture()
+
+
+def test_size_that_changes():
+    camera = Broken([np.zeros((4, 6), np.uint8), np.zeros((4, 8), np.uint8)])
+    camera.capture()
+    with pytest.raises(DeviceError, match="8x4, not 6x4"):
+        camera.capture()
+
+
+def test_exposure_that_is_not_taken():
+    with pytest.raises(DeviceError, match="15 ms, not 10 ms"):
+        Broken([]).set_exposure(0.01)
+
+
+def test_folder_without_images(tmp_path):
+    camera = backend("camera", "folder")
+    with pytest.raises(DeviceError, match="no PNG"):
+        camera(camera.Settings(folder=tmp_path))
+
+
+def test_folder_that_ends_and_damaged_image(scene):
+    camera = backend("camera", "folder")
+    (scene / "002.png").write_bytes(b"not a PNG")
+    device = camera(camera.Settings(folder=scene))
+    device.capture()
+    device.capture()
+    with pytest.raises(DeviceError, match="002"):
+        device.capture()
+    device.capture()
+    with pytest.raises(DeviceTimeout, match="no image left"):
+        device.capture()
+
+
+def test_extras_that_are_missing_say_so(monkeypatch):
+    import sys
+
+    for name, module in (("aravis", "gi"), ("pylon", "pypylon")):
+        monkeypatch.setitem(sys.modules, module, None)
+        camera = backend("camera", name)
+        with pytest.raises(DeviceError, match=rf"weldscan\[{name}\]"):
+            camera(camera.Settings())

@@ -213,7 +213,8 @@ def test_a_robot_that_moved_is_scanned_again(cell, monkeypatch):
     def pushing(*arguments):
         images = original(*arguments)
         if next(pushes, False):
-            cell.arm.place(KukaPose(*POSES["part-1"]))
+            x, *rest = POSES["artefact-2"]
+            cell.arm.place(KukaPose(x + 1.0, *rest))
         return images
 
     monkeypatch.setattr(scan_module, "capture_stack", pushing)

@@ -126,7 +126,12 @@ def inspection(
             BudgetLine("hand-eye and robot pose", 0.0, "both walls lie in each shot: the pose does not enter"),
             BudgetLine("local bias of the scanner", 0.0102, "spread of the sphere radii, 0.010 mm"),
         ),
-        harmonics_mm={"mean": 0.25, "1 (axis offset)": 0.16, "2 (ovality)": 0.004},
+        harmonics_mm={
+            "diameter_difference": 0.5,
+            "diameter_difference_u": 0.01,
+            "axis_offset": 0.16,
+            "axis_offset_at_deg": 205.0,
+        },
         angle_between_walls_deg=0.04,
         coverage_deg=100.0,
     )

@@ -7,6 +7,7 @@ the file and the field: `open-630/session.json: shots.3.flange_pose.B: NaN is no
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import math
 import os
@@ -285,6 +286,11 @@ class Session(_Model):
         if self._folder is None:
             raise InputError("this session was made in memory: it has no folder to read images from")
         return self._folder
+
+    @property
+    def sha256(self) -> str:
+        """Of `session.json`, for the record."""
+        return hashlib.sha256((self.folder / "session.json").read_bytes()).hexdigest()
 
     @property
     def artefact_shots(self) -> tuple[ShotSpec, ...]:

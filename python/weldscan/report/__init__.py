@@ -278,6 +278,7 @@ def html(inspection: Inspection, created: datetime) -> str:
         part_line=part_line(inspection.part),
         view=pictures.cloud_view(cloud) if cloud is not None else None,
         classes=_classes(cloud),
+        harmonics=_harmonics(step),
         budget=[(line, square / total if total else 0.0) for line, square in budget],
         combined=math.sqrt(total),
         matrix=_matrix(hand_eye),
@@ -318,6 +319,24 @@ def _map(cloud: PartCloud, step: StepResult) -> str:
 def _classes(cloud: PartCloud | None) -> list[tuple[str, str, int]]:
     found = counts(cloud)
     return [(name.replace("_", " "), pictures.COLOURS[label], found[name]) for name, label in CLASSES.items()]
+
+
+def _harmonics(step: StepResult | None) -> list[tuple[str, str]]:
+    """`name`, with `name_u` as its expanded uncertainty and `name_at_deg` as its direction, where they are given."""
+    terms = step.harmonics_mm if step else {}
+    shown = []
+    for name, value in terms.items():
+        if name.endswith(("_u", "_at_deg")):
+            continue
+        u, at = terms.get(f"{name}_u"), terms.get(f"{name}_at_deg")
+        text = (
+            f"{value:.3f}"
+            + (f" ± {u:.3f}" if u is not None else "")
+            + " mm"
+            + (f" at {at:.0f}°" if at is not None else "")
+        )
+        shown.append((name.replace("_", " "), text.replace("-", "−")))
+    return shown
 
 
 def _matrix(hand_eye: HandEye | None) -> str:

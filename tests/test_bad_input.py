@@ -177,7 +177,7 @@ def test_a_mirrored_plate_is_refused(run, tmp_path):
 
 
 def test_without_a_robot_one_shot_is_measured_in_the_scanners_frame(run, tmp_path):
-    truth = simulate_session(tmp_path / "session", replace(CELL, robot=None, part_at_deg=(170.0,)))
+    truth = simulate_session(tmp_path / "session", replace(CELL, robot=None, artefact_shots=0, part_at_deg=(170.0,)))
     code, _, complaints = run("inspect", tmp_path / "session")
     assert (code, complaints) == (0, [])
     found = result(tmp_path)

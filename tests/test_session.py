@@ -15,8 +15,19 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from conftest import shared
+from synthetic import hand_eye
 from weldscan import InputError
-from weldscan.session import Session, frame_names, iter_frames, read_frames, read_image, read_session, write_session
+from weldscan.session import (
+    Session,
+    frame_names,
+    iter_frames,
+    read_frames,
+    read_hand_eye,
+    read_image,
+    read_session,
+    write_hand_eye,
+    write_session,
+)
 
 POSE = {"X": 1.0, "Y": 2.0, "Z": 3.0, "A": 10.0, "B": 20.0, "C": 30.0}
 LENS = {"width": 8, "height": 6, "K": [[10, 0, 4], [0, 10, 3], [0, 0, 1]], "dist": [0, 0, 0, 0]}
@@ -267,6 +278,20 @@ def test_a_session_may_carry_its_hand_eye(folder):
     (folder / "session.json").write_text(json.dumps(carried | {"hand_eye": "hand-eye.json"}))
     with pytest.raises(InputError, match=r"hand-eye\.json: id: missing"):
         read_session(folder)
+
+
+def test_a_calibration_is_kept_and_read_back(tmp_path):
+    kept = write_hand_eye(tmp_path / "hand-eye.json", hand_eye())
+    assert np.array_equal(kept.flange_from_scanner, hand_eye().flange_from_scanner) and len(kept.per_shot) == 6
+    assert kept.covariance[0][0] == hand_eye().covariance[0, 0] and kept.id == hand_eye().id
+    write_hand_eye(tmp_path / "hand-eye.json", hand_eye(2))
+    assert len(read_hand_eye(tmp_path / "hand-eye.json").per_shot) == 2
+    (tmp_path / "mine.json").write_text("{}")
+    with pytest.raises(InputError, match="exists and is no hand-eye calibration"):
+        write_hand_eye(tmp_path / "mine.json", hand_eye())
+    with pytest.raises(InputError, match="cannot be written"):
+        write_hand_eye(tmp_path / "nowhere" / "hand-eye.json", hand_eye())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["hand-eye.json", "mine.json"]
 
 
 def png(width=8, height=6, depth=8, colour=0, rows=None, extra=b""):

@@ -16,6 +16,7 @@ import secrets
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar
 
@@ -26,6 +27,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, 
 
 from weldscan._weldcore import Lens, Scanner, decode_png
 from weldscan.errors import InputError
+from weldscan.result import HandEye
 
 Image: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 Frames: TypeAlias = Sequence[Sequence[Image]]
@@ -401,6 +403,50 @@ def read_hand_eye(path: str | os.PathLike[str]) -> HandEyeSpec:
         InputError: missing, not JSON, or a field is wrong; one line that names file and field.
     """
     return _parse(Path(path), HandEyeSpec)
+
+
+def write_hand_eye(path: str | os.PathLike[str], hand_eye: HandEye) -> HandEyeSpec:
+    """Keeps a hand-eye calibration as `weldscan-hand-eye/1`; the file appears complete or not at all.
+
+    Returns:
+        The document as read back.
+
+    Raises:
+        InputError: the file cannot be written, or is there already and is no hand-eye calibration.
+    """
+    path = Path(path)
+    if path.exists():
+        try:
+            read_hand_eye(path)
+        except InputError as error:
+            raise InputError(
+                f"{path}: exists and is no hand-eye calibration: remove it or name another ({error})"
+            ) from None
+    shots = [
+        {
+            "shot": shot.shot,
+            "residual_rms_mm": shot.residual_rms_mm,
+            "left_out_error_mm": shot.left_out_error_mm,
+            "distances_mm": shot.distances_mm,
+            "rms_mm": [sphere.rms_mm for sphere in shot.spheres],
+            "points": [sphere.points for sphere in shot.spheres],
+        }
+        for shot in hand_eye.per_shot
+    ]
+    document = {
+        "schema": HAND_EYE_SCHEMA,
+        **{field.name: getattr(hand_eye, field.name) for field in fields(hand_eye) if field.name != "per_shot"},
+        "per_shot": shots,
+    }
+    partial = path.parent / f".{path.name}.{secrets.token_hex(4)}.partial"
+    try:
+        partial.write_text(to_json(plain(document)), encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+    finally:
+        partial.unlink(missing_ok=True)
+    return read_hand_eye(path)
 
 
 _M = TypeVar("_M", bound=_Model)

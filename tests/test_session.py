@@ -258,9 +258,9 @@ def test_a_session_may_carry_its_hand_eye(folder):
     del carried["artefact"]
     carried["shots"] = carried["shots"][1:]
     assert complaint(folder, json.dumps(carried)).startswith("hand_eye: missing")
-    for hand_eye in (HAND_EYE, "hand-eye.json"):
+    for held in (HAND_EYE, "hand-eye.json"):
         (folder / "hand-eye.json").write_text(json.dumps(HAND_EYE))
-        (folder / "session.json").write_text(json.dumps(carried | {"hand_eye": hand_eye}))
+        (folder / "session.json").write_text(json.dumps(carried | {"hand_eye": held}))
         session = read_session(folder)
         assert session.hand_eye.id == "cell-7"
     (folder.parent / "hand-eye.json").write_text(json.dumps(HAND_EYE))

@@ -16,6 +16,7 @@ __all__ = [
     "PhaseMap",
     "Plane",
     "PlaneFit",
+    "ReferencePlane",
     "Registration",
     "RigidFit",
     "Scanner",
@@ -23,8 +24,12 @@ __all__ = [
     "Sphere",
     "SphereFit",
     "WeakDirection",
+    "WrappedPhase",
     "__version__",
+    "calibrate_reference_plane",
     "decode",
+    "decode_gray",
+    "decode_phase",
     "decode_png",
     "distance",
     "estimate_normals",
@@ -32,6 +37,7 @@ __all__ = [
     "fit_cylinder",
     "fit_plane",
     "fit_sphere",
+    "height_from_reference",
     "register_icp",
     "register_rigid",
     "set_threads",
@@ -39,6 +45,8 @@ __all__ = [
     "simulated_step",
     "sphere_through_points",
     "triangulate",
+    "unwrap_spatial",
+    "unwrap_temporal",
 ]
 
 __version__: str
@@ -112,6 +120,33 @@ def decode(
     z: float = 5.0,
 ) -> PhaseMap: ...
 
+@final
+class WrappedPhase:
+    @property
+    def phase_rad(self) -> NDArray[np.float64]: ...
+    @property
+    def modulation(self) -> NDArray[np.float32]: ...
+    @property
+    def background(self) -> NDArray[np.float32]: ...
+    @property
+    def residual(self) -> NDArray[np.float32]: ...
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]: ...
+
+def decode_phase(images: Sequence[ArrayLike] | NDArray[Any], steps: int | Sequence[int]) -> WrappedPhase: ...
+def unwrap_temporal(wrapped: ArrayLike | WrappedPhase, periods: Sequence[float]) -> NDArray[np.float64]: ...
+def unwrap_spatial(
+    wrapped: ArrayLike | WrappedPhase, mask: ArrayLike | None = None, quality: ArrayLike | None = None
+) -> NDArray[np.float64]: ...
+def decode_gray(
+    images: Sequence[ArrayLike] | NDArray[Any],
+    *,
+    white: ArrayLike | None = None,
+    black: ArrayLike | None = None,
+    inverse: Sequence[ArrayLike] | NDArray[Any] | None = None,
+    wrapped: ArrayLike | None = None,
+    contrast: float = 10.0,
+) -> NDArray[Any]: ...
+
 # triangulate
 @final
 class Cloud:
@@ -120,6 +155,27 @@ class Cloud:
     @property
     def sigma_mm(self) -> NDArray[np.float32] | None: ...
 
+@final
+class ReferencePlane:
+    @property
+    def a(self) -> NDArray[np.float64]: ...
+    @property
+    def b(self) -> NDArray[np.float64]: ...
+    @property
+    def rms_mm(self) -> NDArray[np.float32]: ...
+
+def calibrate_reference_plane(
+    reference_phase: ArrayLike, phases: Sequence[ArrayLike] | NDArray[Any], heights_mm: Sequence[float]
+) -> ReferencePlane: ...
+def height_from_reference(
+    phase: ArrayLike,
+    reference_phase: ArrayLike,
+    *,
+    baseline_mm: float | None = None,
+    distance_mm: float | None = None,
+    period_mm: float | None = None,
+    calibration: ReferencePlane | None = None,
+) -> NDArray[np.float64]: ...
 def triangulate(column: ArrayLike, scanner: Scanner, sigma_px: ArrayLike | None = None, axis: str = "x") -> Cloud: ...
 
 # kdtree

@@ -11,6 +11,7 @@
 
 mod noise;
 mod wave;
+mod wrapped;
 
 use std::f64::consts::TAU;
 
@@ -19,6 +20,8 @@ use rayon::prelude::*;
 
 pub use noise::{Noise, NoiseSource};
 pub use wave::Level;
+pub(crate) use wave::round64;
+pub use wrapped::{WrappedPhase, decode_phase};
 
 use crate::error::{Error, Result, require_positive};
 use crate::threads::{self, CHUNK};

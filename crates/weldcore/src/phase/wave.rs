@@ -187,7 +187,6 @@ pub(crate) fn turns(y: f32, x: f32) -> f32 {
 
 /// atan2(y, x) to 4e-16, as [`turns`].
 #[inline(always)]
-#[allow(dead_code)]
 pub(crate) fn atan2(y: f64, x: f64) -> f64 {
     const TERMS: [f64; 11] = [
         1.0,
@@ -229,7 +228,6 @@ pub(crate) fn round(x: f32) -> f32 {
 
 /// The nearest whole number, for |x| < 2⁵¹.
 #[inline(always)]
-#[allow(dead_code)]
 pub(crate) fn round64(x: f64) -> f64 {
     const SHIFT: f64 = 6_755_399_441_055_744.0;
     (x + SHIFT) - SHIFT

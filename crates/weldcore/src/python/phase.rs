@@ -1,11 +1,17 @@
 //! Decoding as Python sees it.
 
-use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyUntypedArrayMethods};
+use numpy::ndarray::IxDyn;
+use numpy::{
+    PyArray1, PyArray2, PyArrayDyn, PyArrayMethods, PyReadonlyArray2, PyReadonlyArrayDyn, PyUntypedArrayMethods,
+};
 use pyo3::prelude::*;
 
-use super::{compute, raise};
+use super::{compute, float_matrix, floats, raise};
 use crate::error::Error;
-use crate::phase::{DecodeOptions, FringeSet, Level, PhaseMap, Shot, decode_shot};
+use crate::phase::{
+    DecodeOptions, FringeSet, Level, PhaseMap, Shot, WrappedPhase, decode_phase as decode_phase_core, decode_shot,
+};
+use crate::unwrap::{GrayImages, absolute_from_gray, decode_gray as decode_gray_core};
 
 /// Hands a vector to numpy as an image, without a copy.
 pub(super) fn image<T: numpy::Element>(
@@ -204,7 +210,340 @@ fn decode(
     }
 }
 
+/// What `decode_phase` found: arrays (H, W), or (sets, H, W) where `steps` is a list. Used as an array it is the phase.
+#[pyclass(frozen, get_all, module = "weldscan", name = "WrappedPhase")]
+pub(crate) struct PyWrappedPhase {
+    /// In (-pi, pi], rad. float64.
+    phase_rad: Py<PyArrayDyn<f64>>,
+    /// Amplitude, grey levels. float32.
+    modulation: Py<PyArrayDyn<f32>>,
+    /// Mean level. float32.
+    background: Py<PyArrayDyn<f32>>,
+    /// Root of the summed squared residuals over N - 3, grey levels; 0 with three steps. float32.
+    residual: Py<PyArrayDyn<f32>>,
+}
+
+#[pymethods]
+impl PyWrappedPhase {
+    #[pyo3(signature = (dtype=None, copy=None))]
+    fn __array__<'py>(
+        &self,
+        py: Python<'py>,
+        dtype: Option<&Bound<'py, PyAny>>,
+        copy: Option<bool>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let phase = self.phase_rad.bind(py).as_any();
+        match (dtype, copy) {
+            (Some(dtype), _) => phase.call_method1("astype", (dtype,)),
+            (None, Some(true)) => phase.call_method0("copy"),
+            (None, _) => Ok(phase.clone()),
+        }
+    }
+
+    fn __repr__(&self, py: Python<'_>) -> String {
+        format!("WrappedPhase(shape {:?})", self.phase_rad.bind(py).shape())
+    }
+}
+
+/// Images as the core takes them: a list of (H, W) arrays or a stack (N, H, W), of one type, levels as they are.
+enum Images<'py> {
+    U8(Vec<PyReadonlyArray2<'py, u8>>),
+    U16(Vec<PyReadonlyArray2<'py, u16>>),
+    F64(Vec<PyReadonlyArray2<'py, f64>>),
+}
+
+/// The images of an argument, and their shape.
+fn images<'py>(what: &'static str, given: &Bound<'py, PyAny>) -> PyResult<(Images<'py>, [usize; 2])> {
+    let py = given.py();
+    let wrong = |expected: &str, got: String| raise(py, &Error::Shape { what, expected: expected.into(), got });
+    let Ok(items) = given.try_iter() else {
+        return Err(wrong("a stack (N, H, W) or a list of (H, W) images", given.get_type().to_string()));
+    };
+    let frames: Vec<Bound<'py, PyAny>> = items.collect::<PyResult<_>>()?;
+    let mut shape = None;
+    for f in &frames {
+        let here: Option<[usize; 2]> = f.getattr("shape").ok().and_then(|s| s.extract().ok());
+        let here = match here {
+            Some(here) => here,
+            // A nested list is an image, too.
+            None => {
+                let array = float_matrix(what, f)?;
+                [array.shape()[0], array.shape()[1]]
+            }
+        };
+        if *shape.get_or_insert(here) != here {
+            return Err(wrong("images of one size", format!("{shape:?} and {here:?}")));
+        }
+    }
+    fn all<'py, T: numpy::Element>(frames: &[Bound<'py, PyAny>]) -> PyResult<Option<Vec<PyReadonlyArray2<'py, T>>>> {
+        frames.iter().map(frame::<T>).collect()
+    }
+    let shape = shape.ok_or_else(|| wrong("images", "none".into()))?;
+    let images = if let Some(frames) = all::<u8>(&frames)? {
+        Images::U8(frames)
+    } else if let Some(frames) = all::<u16>(&frames)? {
+        Images::U16(frames)
+    } else {
+        Images::F64(frames.iter().map(|f| float_matrix(what, f)).collect::<PyResult<_>>()?)
+    };
+    Ok((images, shape))
+}
+
+fn slices<'a, T: numpy::Element>(arrays: &'a [PyReadonlyArray2<'_, T>]) -> PyResult<Vec<&'a [T]>> {
+    arrays.iter().map(|a| Ok(a.as_slice()?)).collect()
+}
+
+/// The number of steps of each set.
+#[derive(FromPyObject)]
+enum Steps {
+    One(usize),
+    Many(Vec<usize>),
+}
+
+/// The wrapped phase of N-step images: the least-squares sinusoid `A + B cos(phi - 2 pi k/N)` in every pixel.
+///
+/// `phi = atan2(sum I sin(2 pi k/N), sum I cos(2 pi k/N))`, in double precision throughout. No noise, no mask, no
+/// unwrapping: `decode` has them.
+///
+/// Args:
+///     images: (N, H, W) stack or list of (H, W) images, uint8, uint16 or floating point; sets after sets.
+///     steps: N >= 3, or a list of the steps of each set.
+///
+/// Returns:
+///     WrappedPhase: `phase_rad` in (-pi, pi], `modulation` B, `background` A, `residual`; (H, W), or (sets, H, W) where
+///     `steps` is a list. A level that is not finite makes its pixel NaN. Used as an array it is the phase.
+///
+/// Raises:
+///     InputError: as many images as steps are needed, of one size; fewer than three steps.
+///
+/// Source: N-bucket phase shifting, e.g. Zuo et al., Optics and Lasers in Engineering 109 (2018) 23, Eq. 9.
+///
+/// Example:
+///     >>> import numpy as np
+///     >>> from weldscan import decode_phase
+///     >>> images = [np.full((1, 2), 100 + 50 * np.cos(0.7 - 2 * np.pi * k / 3)) for k in range(3)]
+///     >>> decode_phase(images, 3).phase_rad.round(6)
+///     array([[0.7, 0.7]])
+#[pyfunction]
+fn decode_phase(py: Python<'_>, images: &Bound<'_, PyAny>, steps: Steps) -> PyResult<PyWrappedPhase> {
+    let (found, [h, w]) = self::images("images", images)?;
+    let (sets, one) = match steps {
+        Steps::One(n) => (vec![n], true),
+        Steps::Many(list) => (list, false),
+    };
+    let WrappedPhase { phase_rad, modulation, background, residual } = match &found {
+        Images::U8(a) => {
+            let a = slices(a)?;
+            compute(py, || decode_phase_core(&a, &sets))?
+        }
+        Images::U16(a) => {
+            let a = slices(a)?;
+            compute(py, || decode_phase_core(&a, &sets))?
+        }
+        Images::F64(a) => {
+            let a = slices(a)?;
+            compute(py, || decode_phase_core(&a, &sets))?
+        }
+    };
+    let shape = if one { vec![h, w] } else { vec![sets.len(), h, w] };
+    Ok(PyWrappedPhase {
+        phase_rad: shaped(py, phase_rad, &shape)?,
+        modulation: shaped(py, modulation, &shape)?,
+        background: shaped(py, background, &shape)?,
+        residual: shaped(py, residual, &shape)?,
+    })
+}
+
+fn shaped<T: numpy::Element>(py: Python<'_>, values: Vec<T>, shape: &[usize]) -> PyResult<Py<PyArrayDyn<T>>> {
+    Ok(PyArray1::from_vec(py, values).reshape(IxDyn(shape))?.unbind())
+}
+
+/// The absolute phase of the finest fringes, from the wrapped phases of several frequencies.
+///
+/// The frequencies decide how: hierarchical (1, 8, 64), heterodyne by beats and beats of beats (59, 64, 70), in any order.
+/// Every fringe order is the nearest one; `decode` is the function that knows the noise and says when not to trust it.
+///
+/// Args:
+///     wrapped: (sets, ...) rad; any multiple of 2 pi may be missing. One array per frequency.
+///     periods: frequency of each set, periods over the projector.
+///
+/// Returns:
+///     (...) float64, rad: phase of the finest set in [0, 2 pi periods); NaN where any is NaN.
+///
+/// Raises:
+///     InputError: sizes that do not fit; frequencies that cannot be counted over the projector, with the remedy.
+///
+/// Source: Zuo et al., Optics and Lasers in Engineering 85 (2016) 84.
+///
+/// Example:
+///     >>> import numpy as np
+///     >>> from weldscan import unwrap_temporal
+///     >>> truth = np.linspace(0.1, 8 * 2 * np.pi - 0.1, 5)
+///     >>> wrapped = np.angle(np.exp(1j * np.array([truth / 8, truth])))
+///     >>> bool(np.allclose(unwrap_temporal(wrapped, [1, 8]), truth))
+///     True
+#[pyfunction]
+fn unwrap_temporal<'py>(wrapped: &Bound<'py, PyAny>, periods: Vec<f64>) -> PyResult<Py<PyArrayDyn<f64>>> {
+    let py = wrapped.py();
+    let array: PyReadonlyArrayDyn<'_, f64> = floats("wrapped", wrapped)?;
+    let shape = array.shape().to_vec();
+    let Some((&sets, rest)) = shape.split_first() else {
+        let expected = "one array per frequency".into();
+        return Err(raise(py, &Error::Shape { what: "wrapped", expected, got: "one number".into() }));
+    };
+    let all = array.as_slice()?;
+    let size = rest.iter().product::<usize>();
+    let phases: Vec<&[f64]> = (0..sets).filter_map(|i| all.get(i * size..(i + 1) * size)).collect();
+    let z = DecodeOptions::default().z;
+    let out = compute(py, || crate::unwrap::unwrap_temporal(&phases, &periods, z))?;
+    shaped(py, out, rest)
+}
+
+/// Unwraps one phase image in space, reliable pixels first.
+///
+/// Neighbours are joined in the order of their reliability, the smoothness of their surroundings (second differences
+/// along row, column and diagonals); each joint fixes the whole turns between two groups. The answer does not depend on
+/// the number of threads.
+///
+/// Args:
+///     wrapped: (H, W), rad. NaN and infinity stay out.
+///     mask: (H, W) bool, True where a pixel counts.
+///     quality: (H, W), replaces the reliability (modulation, say): pixels of high quality are joined first.
+///
+/// Returns:
+///     (H, W) float64, rad: `wrapped` plus whole turns; NaN where out. Each connected region keeps its first pixel's value.
+///
+/// Raises:
+///     InputError: arrays of different shapes; a quality that is not finite where there is a phase.
+///
+/// Source: Herráez et al., Applied Optics 41 (2002) 7437.
+///
+/// Example:
+///     >>> import numpy as np
+///     >>> from weldscan import unwrap_spatial
+///     >>> truth = np.add.outer(np.arange(20) * 0.4, np.arange(30) * 1.1)
+///     >>> bool(np.allclose(unwrap_spatial(np.angle(np.exp(1j * truth))), truth))
+///     True
+#[pyfunction]
+#[pyo3(signature = (wrapped, mask=None, quality=None))]
+fn unwrap_spatial<'py>(
+    wrapped: &Bound<'py, PyAny>,
+    mask: Option<&Bound<'py, PyAny>>,
+    quality: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Py<PyArray2<f64>>> {
+    let py = wrapped.py();
+    let array = float_matrix("wrapped", wrapped)?;
+    let shape = array.shape().to_vec();
+    let same = |what, got: &[usize]| {
+        let expected = format!("the shape of wrapped, {shape:?}");
+        if got == shape { Ok(()) } else { Err(raise(py, &Error::Shape { what, expected, got: format!("{got:?}") })) }
+    };
+    let quality = quality.map(|q| float_matrix("quality", q)).transpose()?;
+    quality.as_ref().map_or(Ok(()), |q| same("quality", q.shape()))?;
+    let mask: Option<PyReadonlyArray2<'_, bool>> = match mask {
+        Some(given) => {
+            let array = py.import("numpy")?.call_method1("ascontiguousarray", (given,))?;
+            let array = array.cast_into::<PyArray2<bool>>().map_err(|_| {
+                let expected = "an (H, W) array of bool".into();
+                raise(py, &Error::Shape { what: "mask", expected, got: given.get_type().to_string() })
+            })?;
+            same("mask", array.shape())?;
+            Some(array.readonly())
+        }
+        None => None,
+    };
+    let phase = array.as_slice()?;
+    let (m, q) =
+        (mask.as_ref().map(|m| m.as_slice()).transpose()?, quality.as_ref().map(|q| q.as_slice()).transpose()?);
+    let out = compute(py, || crate::unwrap::unwrap_spatial(phase, shape[1], m, q))?;
+    image(py, out, shape[0], shape[1])
+}
+
+/// The Gray code of every pixel, or the absolute phase that it gives to a wrapped one.
+///
+/// Args:
+///     images: (bits, H, W), most significant bit first, uint8, uint16 or floating point.
+///     white, black: (H, W) images of full and no light: a bit is one where it is nearer to white.
+///     inverse: (bits, H, W) inverse patterns, instead of white and black: a bit is one where it is brighter.
+///     wrapped: (H, W), rad. Then the last bit is the complementary one: it changes at half periods of these fringes, and
+///         a period's number changes where its phase is zero. Near that place the order is taken from the code with the
+///         last bit, which does not change there, elsewhere from the code without it.
+///     contrast: least difference (white - black, or image - inverse) in grey levels that tells a bit. Say ten times the
+///         noise of a level.
+///
+/// Returns:
+///     (H, W) int32, the code from 0 to 2^bits - 1, -1 where a bit cannot be told; with `wrapped` (H, W) float64, the
+///     absolute phase in rad, NaN there.
+///
+/// Raises:
+///     InputError: images missing or of different sizes; neither white and black nor inverse, or both.
+///
+/// Source: complementary Gray code, Zhang et al., Optics and Lasers in Engineering 50 (2012) 574.
+///
+/// Example:
+///     >>> import numpy as np
+///     >>> from weldscan import decode_gray
+///     >>> gray = np.arange(4) ^ (np.arange(4) >> 1)
+///     >>> images = [np.uint8(200 * (gray >> b & 1))[None, :] for b in (1, 0)]
+///     >>> decode_gray(images, white=np.full((1, 4), 200, np.uint8), black=np.zeros((1, 4), np.uint8))
+///     array([[0, 1, 2, 3]], dtype=int32)
+#[pyfunction]
+#[pyo3(signature = (images, *, white=None, black=None, inverse=None, wrapped=None, contrast=10.0))]
+fn decode_gray<'py>(
+    images: &Bound<'py, PyAny>,
+    white: Option<&Bound<'py, PyAny>>,
+    black: Option<&Bound<'py, PyAny>>,
+    inverse: Option<&Bound<'py, PyAny>>,
+    wrapped: Option<&Bound<'py, PyAny>>,
+    contrast: f64,
+) -> PyResult<Py<PyAny>> {
+    let py = images.py();
+    let shape = self::images("images", images)?.1;
+    let stack = |what, given: &Bound<'py, PyAny>| -> PyResult<Vec<PyReadonlyArray2<'py, f64>>> {
+        let arrays = given.try_iter()?.map(|f| float_matrix(what, &f?)).collect::<PyResult<Vec<_>>>()?;
+        match arrays.iter().find(|a| a.shape() != shape) {
+            Some(a) => {
+                let (expected, got) = (format!("the shape of the images, {shape:?}"), format!("{:?}", a.shape()));
+                Err(raise(py, &Error::Shape { what, expected, got }))
+            }
+            None => Ok(arrays),
+        }
+    };
+    let bits = stack("images", images)?;
+    let (others, pair) = match (white, black, inverse) {
+        (Some(white), Some(black), None) => {
+            (stack("white and black", pyo3::types::PyTuple::new(py, [white, black])?.as_any())?, true)
+        }
+        (None, None, Some(inverse)) => (stack("inverse", inverse)?, false),
+        _ => {
+            let (expected, got) = ("white and black, or else inverse".into(), "another combination".into());
+            return Err(raise(py, &Error::Shape { what: "images", expected, got }));
+        }
+    };
+    let (bits, others) = (slices(&bits)?, slices(&others)?);
+    let against = match (pair, others.as_slice()) {
+        (true, &[white, black]) => GrayImages::WhiteBlack(white, black),
+        _ => GrayImages::Inverse(&others),
+    };
+    let code = compute(py, || decode_gray_core(&bits, against, contrast))?;
+    let [h, w] = shape;
+    match wrapped {
+        None => Ok(image(py, code, h, w)?.into_any()),
+        Some(given) => {
+            let array = float_matrix("wrapped", given)?;
+            let phase = array.as_slice()?;
+            let out = compute(py, || absolute_from_gray(&code, phase))?;
+            Ok(image(py, out, h, w)?.into_any())
+        }
+    }
+}
+
 pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<PyPhaseMap>()?;
-    m.add_function(wrap_pyfunction!(decode, m)?)
+    m.add_class::<PyWrappedPhase>()?;
+    m.add_function(wrap_pyfunction!(decode, m)?)?;
+    m.add_function(wrap_pyfunction!(decode_phase, m)?)?;
+    m.add_function(wrap_pyfunction!(unwrap_temporal, m)?)?;
+    m.add_function(wrap_pyfunction!(unwrap_spatial, m)?)?;
+    m.add_function(wrap_pyfunction!(decode_gray, m)?)
 }

@@ -8,7 +8,19 @@
 //! for hierarchical (sqrt(r² + 1)) and for heterodyne unwrapping (sqrt((r-1)² + r²)) alike. [`Plan`] finds the chain
 //! whose weakest step is strongest.
 
+mod gray;
+mod spatial;
+
+use std::f64::consts::TAU;
+
+use rayon::prelude::*;
+
+pub use gray::{GrayImages, absolute_from_gray, decode_gray};
+pub use spatial::unwrap_spatial;
+
 use crate::error::{Error, Result};
+use crate::phase::round64;
+use crate::threads::{self, CHUNK};
 
 /// The least phase noise that is worth planning for, rad: 8-bit images at full modulation (B = 100, one grey level of
 /// noise, four steps). A list of fringes that fails even then cannot be unwrapped.
@@ -59,10 +71,12 @@ impl Plan {
     /// Finds the chain for sets of these frequencies; `z` is the safety factor on the noise.
     ///
     /// # Errors
-    /// [`Error::TooFew`] without sets, [`Error::OutOfRange`] for a frequency that is not above zero and for a list that
+    /// [`Error::Shape`] without sets, [`Error::OutOfRange`] for a frequency that is not above zero and for a list that
     /// repeats within the projector's width, or that only noiseless images could unwrap. The message says what to add.
     pub fn new(periods: &[f64], z: f64) -> Result<Self> {
-        crate::error::require_count("fringes", 1, periods.len())?;
+        if periods.is_empty() {
+            return Err(Error::Shape { what: "fringes", expected: "at least one".into(), got: "none".into() });
+        }
         if let Some(p) = periods.iter().find(|p| !(p.is_finite() && **p > 0.0)) {
             let expected = "finite and above 0".into();
             return Err(Error::OutOfRange { what: "fringe periods", expected, value: p.to_string() });
@@ -183,9 +197,71 @@ fn strongest(signals: &[Signal], goal: usize) -> Option<(Vec<&Signal>, f64)> {
     Some((chain, gain))
 }
 
+/// The absolute phase of the finest set, rad, in [0, 2π periods), from the wrapped phases of several. NaN where any is
+/// NaN. Every order is the nearest; [`crate::phase::decode_shot`] is the one that knows the noise and says when not to
+/// trust it.
+///
+/// # Errors
+/// Those of [`Plan::new`], and [`Error::Shape`] where the phases are not of one size, one per frequency.
+pub fn unwrap_temporal(wrapped: &[&[f64]], periods: &[f64], z: f64) -> Result<Vec<f64>> {
+    let plan = Plan::new(periods, z)?;
+    let n = wrapped.first().map_or(0, |w| w.len());
+    if wrapped.len() != periods.len() || wrapped.iter().any(|w| w.len() != n) {
+        let expected = format!("{} phases of one size, one per frequency", periods.len());
+        return Err(Error::Shape { what: "wrapped", expected, got: wrapped.len().to_string() });
+    }
+    let finest = periods.get(plan.finest).copied().unwrap_or(1.0);
+    let whole = |p: &f64| (p - p.round()).abs() < SAME;
+    let cyclic = plan.base.periods == 1.0 && periods.iter().all(whole);
+    let margin = 0.5 * (1.0 - plan.base.periods).max(0.0);
+    let combine = |signal: &Signal, i: usize| -> f64 {
+        let terms = signal.weights.iter().zip(wrapped).filter(|(w, _)| **w != 0.0);
+        terms.map(|(w, phase)| w * phase.get(i).copied().unwrap_or(f64::NAN)).sum::<f64>() / TAU
+    };
+    let absolute = |i: usize| -> f64 {
+        let base = combine(&plan.base, i);
+        let mut turns = base - round64(base + margin - 0.5);
+        for link in &plan.links {
+            let signal = combine(&link.signal, i);
+            turns = signal + round64(turns * link.ratio - signal);
+        }
+        // The finest set's own phase is kept to the last bit; only whole turns are added.
+        let own = wrapped.get(plan.finest).and_then(|w| w.get(i)).copied().unwrap_or(f64::NAN);
+        let mut order = round64(turns - own / TAU);
+        if cyclic {
+            let at = order + own / TAU;
+            order += if at < 0.0 { finest } else { 0.0 };
+            order -= if at >= finest { finest } else { 0.0 };
+        }
+        own + TAU * order
+    };
+    let mut out = vec![0.0; n];
+    threads::install(|| {
+        out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, values)| {
+            values.iter_mut().enumerate().for_each(|(i, v)| *v = absolute(chunk * CHUNK + i));
+        });
+    });
+    Ok(out)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn any_plan_gives_back_the_phase(x in 0.0..1.0f64, which in 0..5usize) {
+            let lists: [&[f64]; 5] =
+                [&[1.0, 8.0, 64.0], &[64.0, 1.0], &[59.0, 64.0, 70.0], &[15.0, 16.0], &[0.8, 5.5, 31.0]];
+            let periods = lists[which];
+            let wrapped: Vec<[f64; 1]> = periods.iter().map(|p| [TAU * (p * x - (p * x).round())]).collect();
+            let wrapped: Vec<&[f64]> = wrapped.iter().map(|w| w.as_slice()).collect();
+            let finest = periods.iter().copied().fold(0.0, f64::max);
+            let found = unwrap_temporal(&wrapped, periods, 5.0).unwrap()[0];
+            prop_assert!((found - TAU * finest * x).abs() < 1e-9);
+        }
+    }
 
     fn chain(periods: &[f64]) -> Vec<f64> {
         let plan = Plan::new(periods, 5.0).unwrap();

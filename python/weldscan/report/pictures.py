@@ -18,7 +18,9 @@ Bytes = NDArray[np.uint8]
 COLOURS = {Label.REFERENCE_WALL: "#3f72af", Label.OTHER_WALL: "#e8a33d", Label.BEAD: "#8b94a1"}
 MAP_ROWS = 150
 MAP_COLUMNS = 620
+# Points that the pictures are made of; more would not be seen.
 SPLATS = 250_000
+MAP_POINTS = 800_000
 
 
 def diverging(values: NDArray[np.floating]) -> Bytes:
@@ -74,16 +76,18 @@ def deviation_map(cloud: PartCloud, extent: Extent, scale_mm: float) -> list[str
     White is zero and full colour +-`scale_mm`; the bead is grey (lighter is higher) and what was not seen transparent.
     """
     total = sum(end - start for start, end in extent.arcs)
-    row = ((extent.high_mm - cloud.axial_mm) * (MAP_ROWS / (extent.high_mm - extent.low_mm))).astype(np.int32)
-    is_bead = cloud.label == Label.BEAD
+    some = slice(None, None, max(1, -(-cloud.label.size // MAP_POINTS)))
+    label, axial, angle = cloud.label[some], cloud.axial_mm[some], cloud.angle_deg[some]
+    row = ((extent.high_mm - axial) * (MAP_ROWS / (extent.high_mm - extent.low_mm))).astype(np.int32)
+    is_bead, deviation = label == Label.BEAD, cloud.deviation_mm[some]
     pictures = []
     for start, end in extent.arcs:
         columns = max(8, round(MAP_COLUMNS * (end - start) / total))
-        column = (np.mod(cloud.angle_deg - np.float32(start), 360) * (columns / (end - start))).astype(np.int32)
-        inside = np.flatnonzero((column < columns) & (row >= 0) & (row < MAP_ROWS) & (cloud.label != Label.NONE))
+        column = (np.mod(angle - np.float32(start), 360) * (columns / (end - start))).astype(np.int32)
+        inside = np.flatnonzero((column < columns) & (row >= 0) & (row < MAP_ROWS) & (label != Label.NONE))
         cell, cells = row[inside] * columns + column[inside], MAP_ROWS * columns
         count = np.bincount(cell, minlength=cells)
-        mean = np.bincount(cell, cloud.deviation_mm[inside], cells) / np.maximum(count, 1)
+        mean = np.bincount(cell, deviation[inside], cells) / np.maximum(count, 1)
         bead = np.bincount(cell[is_bead[inside]], minlength=cells) * 2 > count
         colour = diverging(mean / scale_mm)
         # The bead is no wall: its height would drown the step.

@@ -576,3 +576,34 @@ def test_device_timeout_is_told_in_one_line(tmp_path):
 
 def test_device_timeouts_are_device_errors():
     assert issubclass(DeviceTimeout, DeviceError)
+
+
+def test_the_live_cell(tmp_path):
+    """Everything over its own socket: the session is that of the same cell, rendered, but for the robot's reported
+    poses."""
+    from dataclasses import replace
+
+    from weldscan import Lens
+    from weldscan.devices.simulated import DEFAULT, make_scanner, render, session_document
+    from weldscan.station.live import record_live
+
+    lens = Lens(160, 120, [[326.0, 0, 80.0], [0, 326.0, 60.0], [0, 0, 1]], [0.0, 0.0, 0.0, 0.0])
+    projector = Lens(160, 100, [[260.0, 0, 80.0], [0, 260.0, 50.0], [0, 0, 1]], [0.0, 0.0, 0.0, 0.0])
+    small = replace(
+        DEFAULT, scanner=make_scanner(lens, projector), artefact_shots=2, fringes=(("x", 1, 4), ("x", 8, 4))
+    )
+    said = []
+    record_live(tmp_path / "live", small, lambda done, of, what: said.append((done, of, what)))
+    assert said[-1] == (4, 4, "kept part-2")
+    session, plan = read_session(tmp_path / "live"), session_document(small)
+    assert left_out(tmp_path / "live") == ()
+    assert [shot.name for shot in session.shots] == ["artefact-1", "artefact-2", "part-1", "part-2"]
+    for shot, planned in zip(session.shots, plan["shots"], strict=True):
+        pose = KukaPose(*shot.flange_pose.model_dump().values())
+        assert distance(pose, KukaPose(*planned["flange_pose"].values()))[0] < 0.1
+        expected = render(
+            small, shot.of, pose.matrix() @ np.asarray(small.flange_from_scanner), exposures=[1.0], seed=9
+        )
+        (stack,) = read_frames(session, shot)
+        for image, other in zip(stack, expected.frames[0], strict=True):
+            assert np.abs(image.astype(int) - other).mean() < 4  # the noise is another, the view is the same

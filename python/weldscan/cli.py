@@ -124,6 +124,9 @@ def demo(
     out: Annotated[Path, typer.Option(help="Where session and report go; an earlier demo is replaced.")] = Path(
         "weldscan-demo"
     ),
+    live: Annotated[
+        bool, typer.Option("--live", help="Scan it as a live cell: robot over a socket, camera, projector, shot by shot.")
+    ] = False,
 ) -> None:
     """Simulate a cell (scanner, robot, three-sphere plate, welded pipe), record a session and inspect it."""
     from weldscan.devices.simulated import simulate_session
@@ -131,11 +134,18 @@ def demo(
 
     with whole_folder(out, _is_demo) as partial:
         with _progress() as progress:
-            truth = simulate_session(partial / "session", progress=progress)
+            if live:
+                from weldscan.station.live import record_live
+
+                record_live(partial / "session", tell=progress)
+                truth = None
+            else:
+                truth = simulate_session(partial / "session", progress=progress)
         found = _inspect_into(partial / "session", partial / "report", Method.surface, (DEFAULT_NORM,))
     _summary(found, out / "report")
-    true = truth["step_mm"]
-    print(f"       truth: largest {true['max_abs']:.3f} mm, mean {true['mean']:.3f} mm")
+    if truth is not None:
+        true = truth["step_mm"]
+        print(f"       truth: largest {true['max_abs']:.3f} mm, mean {true['mean']:.3f} mm")
     print(f"       the same again from its images: weldscan inspect {out / 'session'}")
     raise typer.Exit(EXIT_CODES[found.verdict])
 
@@ -235,7 +245,7 @@ def _is_demo(folder: Path) -> bool:
     if not names or not names <= {"session", "report"}:
         return False
     files = {entry.name for entry in (folder / "session").iterdir()} if "session" in names else {"session.json"}
-    known = {"session.json", "shots", "truth.json", "touch.csv"}
+    known = {"session.json", "shots", "truth.json", "touch.csv", "plan.json", "scan.log", ".scan.lock"}
     return "session.json" in files and files <= known and ("report" not in names or is_result(folder / "report"))
 
 

@@ -68,7 +68,7 @@ class Arm:
     ) -> None:
         self.tool, self.base, self.mode, self.interpolation = tool, base, mode, "#BASE"
         self.joints_deg = HOME_JOINTS
-        self.speed_mm_s = T1_SPEED_MM_S
+        self.speed_mm_s, self.turn_speed_deg_s = T1_SPEED_MM_S, TURN_SPEED_DEG_S
         self._start = self._target = flange
         self._start_s, self._seconds = time.monotonic(), 0.0
         self._frozen: KukaPose | None = None
@@ -94,7 +94,7 @@ class Arm:
         self._start = self.flange()
         far_mm, far_deg = distance(self._start, target)
         self._start_s = time.monotonic()
-        self._seconds = max(far_mm / self.speed_mm_s, far_deg / TURN_SPEED_DEG_S)
+        self._seconds = max(far_mm / self.speed_mm_s, far_deg / self.turn_speed_deg_s)
         self._target = target
 
     def place(self, target: KukaPose) -> None:

@@ -413,6 +413,11 @@ def render(cell: Cell, of: Literal["artefact", "part"], base_from_scanner: Float
     return simulate_shot(cell.scanner, base_from_scanner, bodies, cell.fringes, cell.photometry, **options)
 
 
+def session_document(cell: Cell = DEFAULT) -> dict[str, Any]:
+    """Return the session.json that the cell would record, as a document: a plan for a live scan of it."""
+    return _document(cell, _plan(cell), np.random.default_rng(cell.seed))
+
+
 def _document(cell: Cell, shots: Sequence[_Shot], random: np.random.Generator) -> dict[str, Any]:
     scanner_from_flange = np.linalg.inv(cell.flange_from_scanner)
     entries = []

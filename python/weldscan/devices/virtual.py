@@ -61,15 +61,18 @@ class VirtualCameraSettings(CameraSettings):
     """A robot section: the simulated controller that carries this camera; empty: it stands at the first part pose."""
     nominal_exposure_s: Annotated[float, Field(gt=0)] = 1 / 30
     """The exposure that the simulated cell is lit for."""
+    cell: Any = None
+    """A `weldscan.devices.simulated.Cell`, where a program makes the configuration; absent: the demo's."""
 
 
 class VirtualCamera(Camera):
-    """A camera in the simulated cell (`weldscan.devices.simulated.DEFAULT`)."""
+    """A camera in the simulated cell."""
 
     Settings = VirtualCameraSettings
     settings: VirtualCameraSettings
 
-    def __init__(self, settings: VirtualCameraSettings, cell: Cell = DEFAULT) -> None:
+    def __init__(self, settings: VirtualCameraSettings) -> None:
+        cell: Cell = DEFAULT if settings.cell is None else settings.cell
         self.settings, self.cell = settings, cell
         self.name = "simulated camera"
         self._patterns = list(

@@ -160,7 +160,7 @@ def test_aravis_200_frames(fake_gige, soak):
     camera = backend("camera", "aravis")
     name, _ = fake_gige()
     with camera(camera.Settings(device=name, width=1280, height=960, exposure_s=0.005, timeout_s=5.0)) as device:
-        count = 200 if soak else 20
+        count = 200 if soak else 10
         frames = [device.capture() for _ in range(count)]
         assert {frame.image.shape for frame in frames} == {(960, 1280)}
         assert all(is_whole(frame.image) for frame in frames)
@@ -175,8 +175,8 @@ def test_aravis_lost_packets_become_retries(fake_gige, soak):
         device=name, width=1280, height=960, exposure_s=0.005, timeout_s=30.0, retries=100, packet_size=LARGE_PACKETS
     )
     with camera(settings) as device:
-        frames = [device.capture() for _ in range(200 if soak else 25)]
-        assert sum(frame.retries for frame in frames) > 0
+        frames = [device.capture() for _ in range(200 if soak else 10)]
+        assert sum(frame.retries for frame in frames) > 0  # 40 packets a frame: 0.45 of the frames are whole at once
         assert all(is_whole(frame.image) for frame in frames)
 
 

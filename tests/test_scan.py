@@ -85,7 +85,7 @@ class Cell:
             cv2.imwrite(str(folder / "images" / f"{number:03d}.png"), image)
         (folder / "plan.json").write_text(json.dumps(plan_document()))
         self.arm = Arm(KukaPose(*POSES["artefact-1"]))
-        self.arm.speed_mm_s = 5000.0
+        self.arm.speed_mm_s, self.arm.turn_speed_deg_s = 5000.0, 1000.0
         self.controller = KvpController(self.arm)
         self.controller.restart_s = 0.3
         options = {"port": self.controller.port, "allow_motion": True, "timeout_s": 2.0, "move_timeout_s": 3.0} | robot
@@ -513,7 +513,7 @@ def test_killed_at_random_moments(tmp_path, soak):
     """SIGKILL, then --resume, again and again: nothing that was acknowledged is lost, and nothing half is read."""
     moments = random.Random(5)
     kills = in_the_middle = rounds = 0
-    while kills < (200 if soak else 4):
+    while kills < (200 if soak else 3):
         folder = tmp_path / str(rounds)
         rounds += 1
         folder.mkdir()
@@ -545,7 +545,7 @@ def test_killed_at_random_moments(tmp_path, soak):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_ends_cleanly_and_says_how_to_go_on(cell, number):
-    cell.arm.speed_mm_s = 20.0
+    cell.arm.speed_mm_s = 10.0
     scanning = start(cell)
     for line in scanning.stderr:
         if "going to artefact-2" in line:

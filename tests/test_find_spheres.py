@@ -89,6 +89,30 @@ def test_planes_pipes_boxes_and_pins_are_refused() -> None:
         assert weldscan.find_spheres(grid.reshape(-1, 3), RADIUS) == [], name
 
 
+@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 1e-2])
+@pytest.mark.parametrize("number", [200, 1000, 20_000])
+def test_bare_clouds_of_any_density_among_strays_before_a_plate(number: int, noise: float, whole: bool) -> None:
+    rng = np.random.default_rng(number)
+    centres = np.array([[0, 0, 40], [3.0, 0.5, 40.5], [-0.5, 3.2, 41]]) * RADIUS
+    cloud = []
+    for centre in centres:
+        d = rng.normal(size=(number, 3))
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        d[:, 2] = d[:, 2] if whole else -np.abs(d[:, 2])
+        cloud.append(centre + d * RADIUS * (1 + noise * rng.normal(size=(number, 1))))
+    plate = rng.uniform(-6, 6, (3 * number, 3)) * RADIUS
+    plate[:, 2] = RADIUS * (47 + noise * rng.normal(size=len(plate)))
+    strays = rng.uniform(-6, 6, (number // 3, 3)) * RADIUS + [0, 0, 40 * RADIUS]
+    points = rng.permutation(np.vstack([*cloud, plate, strays]))
+    found = weldscan.find_spheres(points, RADIUS)
+    assert len(found) == 3
+    for centre in centres:
+        miss = min(np.abs(f.center_mm - centre).max() for f in found)
+        # Six standard deviations; half the sphere tells each coordinate at least a quarter as well as the mean of all.
+        assert miss < RADIUS * (1e-9 + 6 * noise * 4 / np.sqrt(number))
+
+
 def test_whatever_numpy_takes_is_taken() -> None:
     points = view(BALLS)
     first = weldscan.find_spheres(points, RADIUS, 3)

@@ -10,8 +10,8 @@ use crate::threads;
 
 const WHAT: &str = "cylinder";
 
-/// A cylinder without ends. The parameters of its covariance: point x, y, z (mm), axis x, y, z (1) and, where it was fitted,
-/// the radius (mm). Its rank is 4 or 5: point and axis move across the axis alone.
+/// A cylinder without ends. The parameters of its covariance: point x, y, z (mm), axis x, y, z (1) and, where it was
+/// fitted, the radius (mm). Its rank is 4 or 5: point and axis move across the axis alone.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Cylinder {
     /// The point of the axis nearest to the (weighted) mean of the data, mm.
@@ -100,8 +100,8 @@ impl Model<4> for Unknown {
 /// them refined on a sample of the points. At least 5 points (4 with a given radius).
 ///
 /// # Errors
-/// Not finite, too few, a radius or weights out of range; [`Error::Degenerate`] for points that are all equal, collinear
-/// or coplanar, or too flat for their noise.
+/// Not finite, too few, a radius or weights out of range; [`Error::Degenerate`] for points that are all equal,
+/// collinear or coplanar, or too flat for their noise.
 pub fn fit(points: &[[f64; 3]], radius_mm: Option<f64>, noise: Noise) -> Result<Fit<Cylinder>> {
     let counted = noise.check(points, if radius_mm.is_some() { 4 } else { 5 })?;
     if let Some(radius) = radius_mm {
@@ -285,8 +285,8 @@ fn circle(points: &[[f64; 3]], axes: Matrix3<f64>, radius: Option<f64>) -> Optio
     cost.is_finite().then(|| (cost, Unknown::new(point, axes, r)))
 }
 
-/// The cylinder along `axis` whose circle goes through three points; with a known radius, the circle of that radius through
-/// the first two on the side of the third. `None` where there is none.
+/// The cylinder along `axis` whose circle goes through three points; with a known radius, the circle of that radius
+/// through the first two on the side of the third. `None` where there is none.
 pub(super) fn through(points: &[[f64; 3]; 3], axis: &Vec3, radius: Option<f64>) -> Option<Cylinder> {
     let axes = any_frame(axis);
     let [a, b, c] = points.map(|p| axes * Vec3::from(p)).map(|v| (v[0], v[1]));

@@ -1,8 +1,9 @@
 //! Plane, sphere and cylinder by orthogonal distance, with covariance; robust starts; spheres found in a cloud.
 //!
 //! Every fit minimises the weighted sum of squared orthogonal distances, `Σ wᵢ·dᵢ²`, by Levenberg-Marquardt from an
-//! analytic start, in coordinates that are centred on the data and scaled by a power of two (which is exact). The normal
-//! matrix only steers the steps; where they end is decided by the gradient, so that nothing of the precision is lost to it.
+//! analytic start, in coordinates that are centred on the data and scaled by a power of two (which is exact). The
+//! normal matrix only steers the steps; where they end is decided by the gradient, so that nothing of the precision is
+//! lost to it.
 
 pub mod cylinder;
 pub mod plane;
@@ -348,7 +349,8 @@ impl<const P: usize> Normal<P> {
         Some(x)
     }
 
-    /// `-(N + damping·diag N)⁻¹ g` by Cholesky with the diagonal scaled to 1, or from the root; `None` where N is not positive.
+    /// `-(N + damping·diag N)⁻¹ g` by Cholesky with the diagonal scaled to 1, or from the root; `None` where N is not
+    /// positive.
     fn step(&self, damping: f64) -> Option<SVector<f64, P>> {
         if let (Some((root, right)), true) = (&self.root, damping == 0.0) {
             return Self::exact_step(root, right);
@@ -589,7 +591,9 @@ mod tests {
         }
 
         #[test]
-        fn nothing_panics(points in prop::collection::vec(prop::array::uniform3(any::<f64>()), 0..9), r in any::<f64>()) {
+        fn nothing_panics(
+            points in prop::collection::vec(prop::array::uniform3(any::<f64>()), 0..9), r in any::<f64>(),
+        ) {
             let _ = plane::fit(&points, Noise::default());
             for radius in [None, Some(r)] {
                 let _ = sphere::fit(&points, radius, Noise::default());

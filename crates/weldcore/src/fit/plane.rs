@@ -8,8 +8,8 @@ use crate::error::{Error, Result};
 
 const WHAT: &str = "plane";
 
-/// A plane. The parameters of its covariance: point x, y, z (mm), normal x, y, z (1). Its rank is 3: the point moves along
-/// the normal alone, and the normal across itself.
+/// A plane. The parameters of its covariance: point x, y, z (mm), normal x, y, z (1). Its rank is 3: the point moves
+/// along the normal alone, and the normal across itself.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Plane {
     /// The point of the plane at the (weighted) mean of the data, mm.
@@ -73,8 +73,8 @@ pub(super) fn upright(direction: Vec3) -> Vec3 {
 /// Minimises `Σ w·((p - point)·normal)²` over the plane.
 ///
 /// # Errors
-/// Not finite, fewer than 3 points, weights out of range; [`Error::Degenerate`] where the points are equal or collinear, or
-/// spread as far in a second direction as across the plane.
+/// Not finite, fewer than 3 points, weights out of range; [`Error::Degenerate`] where the points are equal or
+/// collinear, or spread as far in a second direction as across the plane.
 pub fn fit(points: &[[f64; 3]], noise: Noise) -> Result<Fit<Plane>> {
     let counted = noise.check(points, 3)?;
     let local = Local::of(WHAT, points, &noise)?;

@@ -1,11 +1,11 @@
-//! Fits among outliers: random minimal samples judged by a truncated cost (MSAC), reweighting from the best of them, and a
-//! last fit, untruncated, on the points within three standard deviations.
+//! Fits among outliers: random minimal samples judged by a truncated cost (MSAC), reweighting from the best of them,
+//! and a last fit, untruncated, on the points within three standard deviations.
 //!
-//! The noise is taken from the data, so no threshold is asked for. Random numbers are functions of a seed and a counter:
-//! the same seed gives the same bits on any number of threads.
+//! The noise is taken from the data, so no threshold is asked for. Random numbers are functions of a seed and a
+//! counter: the same seed gives the same bits on any number of threads.
 //!
-//! Sources: Torr and Zisserman, MLESAC, CVIU 78 (2000), for MSAC; Rousseeuw, Least median of squares regression, JASA 79
-//! (1984), for the scale; Holland and Welsch (1977) for reweighting, with Tukey's biweight.
+//! Sources: Torr and Zisserman, MLESAC, CVIU 78 (2000), for MSAC; Rousseeuw, Least median of squares regression, JASA
+//! 79 (1984), for the scale; Holland and Welsch (1977) for reweighting, with Tukey's biweight.
 
 use super::cylinder::{self, Cylinder};
 use super::plane::{self, Plane};

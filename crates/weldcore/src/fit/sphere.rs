@@ -69,8 +69,8 @@ impl Model<3> for Unknown {
 /// the side of the less squared distance is taken.
 ///
 /// # Errors
-/// Not finite, too few, a radius or weights out of range; [`Error::Degenerate`] for points that are all equal, collinear
-/// or coplanar (free radius), or too flat for their noise.
+/// Not finite, too few, a radius or weights out of range; [`Error::Degenerate`] for points that are all equal,
+/// collinear or coplanar (free radius), or too flat for their noise.
 pub fn fit(points: &[[f64; 3]], radius_mm: Option<f64>, noise: Noise) -> Result<Fit<Sphere>> {
     let counted = noise.check(points, if radius_mm.is_some() { 3 } else { 4 })?;
     if let Some(radius) = radius_mm {

@@ -88,10 +88,12 @@ impl FoundSphere {
 /// Normals vote for centres; where votes meet, a sphere of fixed radius is fitted by orthogonal distance to the points
 /// within three standard deviations (the noise is taken from the data) and within 60° of the line of sight (the cone of
 /// ASTM E3125: beyond it light is seen too obliquely). What is not a sphere of that size is refused: planes, cylinders,
-/// edges, spheres whose radius, set free, misses the given one by more than four of its standard uncertainties and 0.5 %.
+/// edges, spheres whose radius, set free, misses the given one by more than four of its standard uncertainties and 0.5
+/// %.
 ///
 /// Args:
-///     points: (H, W, 3) float64, the pixel grid of a scanner (rows down, columns right), NaN where a pixel has no point;
+///     points: (H, W, 3) float64, the pixel grid of a scanner (rows down, columns right), NaN where a pixel has no
+///     point;
 ///         or (n, 3), a bare cloud without NaN. mm, any frame; a bare cloud whose origin is the scanner's is trimmed to
 ///         the cone about the line of sight, any other is not.
 ///     radius_mm: radius of the spheres, mm.
@@ -290,8 +292,8 @@ result_class!(
 
         fn __repr__(&self) -> String {
             let s = &self.surface;
-            let (point, axis) = (triple(&s.point_mm), triple(&s.axis));
-            format!("CylinderFit(point_mm={point}, axis={axis}, radius_mm={:.6}, {}", s.radius_mm, self.common.describe())
+            let (point, axis, rest) = (triple(&s.point_mm), triple(&s.axis), self.common.describe());
+            format!("CylinderFit(point_mm={point}, axis={axis}, radius_mm={:.6}, {rest}", s.radius_mm)
         }
     }
 );
@@ -375,8 +377,8 @@ fn fit_plane(
 ///     seed: of the random samples; the same seed gives the same result.
 ///
 /// Returns:
-///     SphereFit with `center_mm`, `radius_mm`, `rms_mm`, `covariance` (centre and, where it was fitted, radius; mm²; NaN
-///     without redundancy), `iterations`, `inliers`.
+///     SphereFit with `center_mm`, `radius_mm`, `rms_mm`, `covariance` (centre and, where it was fitted, radius; mm²;
+///     NaN without redundancy), `iterations`, `inliers`.
 ///
 /// Raises:
 ///     InputError: wrong shape, NaN or infinity, radius, weights or sigma out of range.
@@ -417,7 +419,8 @@ fn fit_sphere(
 ///     radius_mm: the radius where it is known (a pipe seen as a short arc); None: it is fitted.
 ///     weights: (n,) float64, relative weights 1/sigma**2; None: all equal. Not together with `robust`.
 ///     sigma_mm: standard deviation of a point (of weight 1) along the normal; None: the residuals tell it.
-///     robust: outliers may be present (up to 60 %): MSAC start over directions of the whole hemisphere, reweighting, and
+///     robust: outliers may be present (up to 60 %): MSAC start over directions of the whole hemisphere, reweighting,
+///     and
 ///         a last fit without truncation on the points within three standard deviations.
 ///     seed: of the random samples; the same seed gives the same result.
 ///

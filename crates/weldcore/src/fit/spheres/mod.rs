@@ -1,22 +1,22 @@
 //! Spheres of a known size, found in a raw cloud without any other hint.
 //!
-//! The cloud is cut into cells an eighth of the radius wide: tiles of a pixel grid, or voxels. Each cell has a normal and
-//! votes for the centre at one radius along it, on either side. Where votes meet, a sphere of fixed radius is fitted,
-//! first to the cells, then to the points. A place is refused unless it looks like a sphere of that size in every respect:
-//! its surroundings lie on it, enough of the cap is seen, the noise leaves its shape visible, and the radius, set free,
-//! comes out right within its own uncertainty.
+//! The cloud is cut into cells an eighth of the radius wide: tiles of a pixel grid, or voxels. Each cell has a normal
+//! and votes for the centre at one radius along it, on either side. Where votes meet, a sphere of fixed radius is
+//! fitted, first to the cells, then to the points. A place is refused unless it looks like a sphere of that size in
+//! every respect: its surroundings lie on it, enough of the cap is seen, the noise leaves its shape visible, and the
+//! radius, set free, comes out right within its own uncertainty.
 
-use std::collections::HashMap;
-use std::hash::{BuildHasherDefault, Hasher};
+mod cells;
+mod votes;
 
 use nalgebra::{Matrix3, Matrix4, Vector4};
-use rayon::prelude::*;
 
+use self::cells::{Cell, Cloud, Layout, finite};
+use self::votes::Votes;
+use super::Noise;
 use super::sphere::{self, Sphere};
-use super::{Noise, principal};
 use crate::Vec3;
 use crate::error::{Error, Result, require_finite, require_positive};
-use crate::threads;
 
 /// The cap that counts: half-angle about the line of sight. Beyond it light falls and is seen too obliquely; the same
 /// 120° cone in which ASTM E3125 evaluates scanned spheres.
@@ -35,14 +35,16 @@ const NOISE: f64 = 0.03;
 const SCALE: f64 = 0.005;
 /// Coverage factor of the free radius.
 const SIGMAS: f64 = 4.0;
+/// The size is told when the free radius is known to this part of it; a plane passes for a sphere otherwise.
+const TELLING: f64 = 0.25;
 /// Places looked at before the search gives up; votes of a cylinder of the same radius meet all along its axis.
 const MAX_PLACES: usize = 256;
 /// Voxels of votes followed uphill.
 const MAX_PEAKS: usize = 4096;
 /// Votes meet in a ball of this part of the radius, ...
 const BALL: f64 = 0.2;
-/// ... and must be this many times those that a plane leaves in one.
-const ABOVE_PLANE: f64 = 2.0;
+/// ... and must be this many times those that a plane leaves in one. A sphere of the least coverage leaves seven times.
+const ABOVE_PLANE: f64 = 3.0;
 
 /// What no scanner's calibration is free of: a two-hundredth of a pixel, in each direction, common to a whole sphere.
 const SYSTEMATIC_PX: f64 = 0.005;
@@ -69,8 +71,8 @@ pub struct Found {
 
 /// Finds the spheres of radius `radius_mm` in a cloud.
 ///
-/// `width` is that of a pixel grid (row by row, NaN where a pixel has no point); without it the cloud is bare and all of it
-/// must be finite. With `count` the best `count` are returned, or an error that says why there are not so many.
+/// `width` is that of a pixel grid (row by row, NaN where a pixel has no point); without it the cloud is bare and all
+/// of it must be finite. With `count` the best `count` are returned, or an error that says why there are not so many.
 /// The order is that of the number of inliers, most first.
 ///
 /// # Errors
@@ -101,115 +103,14 @@ pub fn find(points: &[[f64; 3]], width: Option<usize>, radius_mm: f64, count: Op
     }
     Ok(found)
 }
-
-/// A small patch of the cloud.
-#[derive(Debug, Clone, Copy, Default)]
-struct Cell {
-    points: usize,
-    mean: Vec3,
-    /// Unit normal; zero where there is none. On a grid its sign is that of the camera's side.
-    normal: Vec3,
-    /// Mean column and row.
-    pixel: [f64; 2],
-}
-
-enum Layout {
-    Grid { width: usize, tile: usize, columns: usize },
-    Bare { order: Vec<usize>, starts: Vec<usize> },
-}
-
-struct Cloud<'a> {
-    points: &'a [[f64; 3]],
-    layout: Layout,
-    cells: Vec<Cell>,
-    /// Side of a cell, mm.
-    side: f64,
-}
-
-fn finite(p: &[f64; 3]) -> bool {
-    (p[0] + p[1] + p[2]).is_finite()
-}
-
-impl<'a> Cloud<'a> {
-    fn of_grid(points: &'a [[f64; 3]], width: usize, radius: f64) -> Result<Self> {
-        if width == 0 || !points.len().is_multiple_of(width) {
-            let got = format!("{} points", points.len());
-            return Err(Error::Shape { what: "points", expected: format!("rows of {width} pixels"), got });
-        }
-        let (tile, side) = tile_size(points, width, radius);
-        let columns = width.div_ceil(tile);
-        let rows: Vec<std::result::Result<Vec<Cell>, usize>> = threads::install(|| {
-            points.par_chunks(width * tile).enumerate().map(|(r, band)| band_cells(band, width, tile, r)).collect()
-        });
-        let mut cells = Vec::with_capacity(rows.len() * columns);
-        for row in rows {
-            cells.extend(row.map_err(|index| Error::NonFinite { what: "points", index })?);
-        }
-        Ok(Self { points, layout: Layout::Grid { width, tile, columns }, cells, side })
-    }
-
-    fn of_bare(points: &'a [[f64; 3]], radius: f64) -> Self {
-        // Normals need about this many points.
-        const ENOUGH: f64 = 12.0;
-        let mut size = radius / 8.0;
-        loop {
-            let voxels = Voxels::of(points, size);
-            let merged: Vec<Sums> =
-                threads::install(|| (0..voxels.keys.len()).into_par_iter().map(|i| voxels.merged(i)).collect());
-            // As a typical point sees it: strays fill many voxels.
-            let mut counts: Vec<(f64, f64)> = merged.iter().zip(&voxels.sums).map(|(m, s)| (m.n, s.n)).collect();
-            counts.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
-            let mut below = 0.0;
-            let middle = counts.iter().find(|c| {
-                below += c.1;
-                2.0 * below >= points.len() as f64
-            });
-            let typical = middle.map_or(0.0, |c| c.0);
-            if typical < ENOUGH && size < radius / 3.0 && !points.is_empty() {
-                size *= 1.3;
-                continue;
-            }
-            let cell = |i: usize| {
-                let m = &merged[i];
-                let (mean, normal) = m.plane();
-                let offset = Vec3::from_fn(|k, _| voxels.origin[k] + (voxels.keys[i][k] as f64 + 0.5) * size);
-                Cell { points: voxels.sums[i].n as usize, mean: mean * size + offset, normal, pixel: [0.0; 2] }
-            };
-            let cells = threads::install(|| (0..merged.len()).into_par_iter().map(cell).collect());
-            return Self {
-                points,
-                layout: Layout::Bare { order: voxels.order, starts: voxels.starts },
-                cells,
-                side: size,
-            };
-        }
-    }
-
-    /// Calls `job` with the index of every point of a cell.
-    fn members(&self, cell: usize, mut job: impl FnMut(usize)) {
-        match &self.layout {
-            Layout::Grid { width, tile, columns } => {
-                let (row, column) = (cell / columns * tile, cell % columns * tile);
-                for r in row..(row + tile).min(self.points.len() / width) {
-                    for c in column..(column + tile).min(*width) {
-                        job(r * width + c);
-                    }
-                }
-            }
-            Layout::Bare { order, starts } => {
-                let end = starts.get(cell + 1).copied().unwrap_or(order.len());
-                order.get(starts[cell]..end).unwrap_or_default().iter().for_each(|&i| job(i));
-            }
-        }
-    }
-
+impl Cloud<'_> {
     fn search(&self, radius: f64) -> (Vec<Found>, Vec<(Vec3, String)>) {
-        let votes = Votes::of(&self.cells, radius);
+        let votes = Votes::of(&self.cells, radius, BALL * radius);
         let (mut found, mut refused): (Vec<Found>, Vec<(Vec3, String)>) = (Vec::new(), Vec::new());
         let mut looked: Vec<Vec3> = Vec::new();
         let plane = std::f64::consts::PI * (BALL * radius / self.side).powi(2);
         let enough = (ABOVE_PLANE * plane).max(4.0);
-        for peak in votes.peaks() {
+        for peak in votes.peaks().into_iter().take(MAX_PEAKS) {
             if looked.len() >= MAX_PLACES {
                 break;
             }
@@ -240,8 +141,8 @@ impl<'a> Cloud<'a> {
         let limit = CAP_RAD.cos();
         // All points that could be on it, with the cell they belong to.
         let mut near: Vec<(usize, usize)> = Vec::new();
-        for (k, cell) in self.cells.iter().enumerate() {
-            if cell.points > 0 && ((cell.mean - center).norm() - radius).abs() < 0.5 * radius {
+        for (k, cell) in self.around(center) {
+            if ((cell.mean - center).norm() - radius).abs() < 0.5 * radius {
                 self.members(k, |i| {
                     if finite(&self.points[i]) {
                         near.push((i, k));
@@ -311,6 +212,9 @@ impl<'a> Cloud<'a> {
         }
         let free = sphere::refine(&points, fixed.surface, true, Noise::default()).map_err(|e| e.to_string())?;
         let sigma_radius = (free.covariance[(3, 3)] * correlation(on, &points, &free.surface, 4)).sqrt();
+        if SIGMAS * sigma_radius > TELLING * radius {
+            return Err(format!("{} points do not tell its size", on.len()));
+        }
         let miss = (free.surface.radius_mm - radius).abs();
         if miss > SIGMAS * sigma_radius + SCALE * radius {
             let seen = free.surface.radius_mm;
@@ -360,10 +264,8 @@ impl<'a> Cloud<'a> {
         }
         // The same test as for the points, before they are looked at.
         let mut sizes: Vec<f64> = self
-            .cells
-            .iter()
-            .filter(|c| c.points > 0)
-            .map(|c| ((c.mean - center).norm() - radius).abs())
+            .around(center)
+            .map(|(_, c)| ((c.mean - center).norm() - radius).abs())
             .filter(|r| *r < ZONE * radius)
             .collect();
         let middle = sizes.len() / 2;
@@ -376,15 +278,16 @@ impl<'a> Cloud<'a> {
     /// Cells near the sphere's surface whose normals point to or from its centre.
     fn agreeing(&self, center: Vec3, radius: f64) -> impl Iterator<Item = &Cell> {
         const AGREE: f64 = 0.9; // cosine; 26°, more than the turn of the surface over a cell and its neighbours
-        self.cells.iter().filter(move |c| {
+        self.around(center).map(|(_, c)| c).filter(move |c| {
             let d = c.mean - center;
             let r = d.norm();
-            c.points > 0 && (r - radius).abs() < 0.125 * radius && c.normal.dot(&d).abs() > AGREE * r
+            (r - radius).abs() < 0.125 * radius && c.normal.dot(&d).abs() > AGREE * r
         })
     }
 
-    /// Unit vector from the centre to the viewer. On a grid the pixel coordinates near the sphere are an affine function of
-    /// the points, and do not change along it; a bare cloud is seen from its origin if all of its points can be.
+    /// Unit vector from the centre to the viewer. On a grid the pixel coordinates near the sphere are an affine
+    /// function of the points, and do not change along it; a bare cloud is seen from its origin if all of its points
+    /// can be.
     fn line_of_sight(&self, center: Vec3, radius: f64) -> Option<Vec3> {
         match self.layout {
             Layout::Grid { .. } => {
@@ -481,267 +384,10 @@ fn coverage(points: &[[f64; 3]], center: Vec3, axis: Vec3) -> f64 {
     }
     seen.iter().filter(|s| **s).count() as f64 / (rings * sectors) as f64
 }
-
-/// Pixels along the side of a tile that is an eighth of the radius wide, and its width in mm, from the typical distance of neighbours.
-fn tile_size(points: &[[f64; 3]], width: usize, radius: f64) -> (usize, f64) {
-    const APART: usize = 4;
-    // A prime stride visits all columns; some thousand pairs tell the median well enough.
-    let stride = (points.len() / 8192).max(1) | 1;
-    let mut pitches: Vec<f64> = (0..points.len())
-        .step_by(stride)
-        .filter(|i| i % width + APART < width)
-        .map(|i| (Vec3::from(points[i + APART]) - Vec3::from(points[i])).norm() / APART as f64)
-        .filter(|d| d.is_finite() && *d > 0.0)
-        .collect();
-    if pitches.is_empty() {
-        return (2, radius);
-    }
-    let middle = pitches.len() / 2;
-    let pitch = *pitches.select_nth_unstable_by(middle, f64::total_cmp).1;
-    let tile = ((radius / 8.0 / pitch) as usize).clamp(2, 64);
-    (tile, tile as f64 * pitch)
-}
-
-/// The cells of a band of `tile` rows; the index of an infinite coordinate if there is one.
-fn band_cells(band: &[[f64; 3]], width: usize, tile: usize, number: usize) -> std::result::Result<Vec<Cell>, usize> {
-    let columns = width.div_ceil(tile);
-    let mut cells = Vec::with_capacity(columns);
-    for first in (0..width).step_by(tile) {
-        let mut sums = [0.0; 15];
-        let mut origin = None;
-        for (row, line) in band.chunks(width).enumerate() {
-            let Some(part) = line.get(first..(first + tile).min(width)) else { continue };
-            for (column, p) in part.iter().enumerate() {
-                if !finite(p) {
-                    if p.iter().any(|v| v.is_infinite()) {
-                        return Err((number * tile + row) * width + first + column);
-                    }
-                    continue;
-                }
-                let o = *origin.get_or_insert(*p);
-                let (u, v) = (column as f64, row as f64);
-                let (x, y, z) = (p[0] - o[0], p[1] - o[1], p[2] - o[2]);
-                let terms = [1.0, u, v, u * u, u * v, v * v, x, y, z, x * u, y * u, z * u, x * v, y * v, z * v];
-                sums.iter_mut().zip(terms).for_each(|(s, t)| *s += t);
-            }
-        }
-        cells.push(tile_cell(&sums, origin, first, number * tile, tile));
-    }
-    Ok(cells)
-}
-
-/// Mean and normal of a tile: the points as a linear function of the pixel, whose slopes span the surface. The pixel is
-/// exact and the depth noisy, so this is also right where the surface is steep.
-fn tile_cell(sums: &[f64; 15], origin: Option<[f64; 3]>, column: usize, row: usize, tile: usize) -> Cell {
-    let Some(origin) = origin else { return Cell::default() };
-    let [n, u, v, uu, uv, vv, ..] = *sums;
-    let (mu, mv) = (u / n, v / n);
-    let mean = Vec3::new(sums[6], sums[7], sums[8]) / n;
-    let mut cell = Cell {
-        points: n as usize,
-        mean: mean + Vec3::from(origin),
-        normal: Vec3::zeros(),
-        pixel: [column as f64 + mu, row as f64 + mv],
-    };
-    let (suu, suv, svv) = (uu / n - mu * mu, uv / n - mu * mv, vv / n - mv * mv);
-    let determinant = suu * svv - suv * suv;
-    // Half a tile must be there, in both directions.
-    if 2.0 * n >= (tile * tile) as f64 && determinant > 1e-3 {
-        let pu = Vec3::new(sums[9], sums[10], sums[11]) / n - mean * mu;
-        let pv = Vec3::new(sums[12], sums[13], sums[14]) / n - mean * mv;
-        let along_u = (pu * svv - pv * suv) / determinant;
-        let along_v = (pv * suu - pu * suv) / determinant;
-        cell.normal = along_v.cross(&along_u).try_normalize(0.0).unwrap_or_default();
-    }
-    cell
-}
-
-type Key = [i64; 3];
-
-/// Spreads the bits of small integers; the default hasher guards against attacks that nobody makes on voxels.
-#[derive(Default)]
-struct Spread(u64);
-
-impl Hasher for Spread {
-    fn finish(&self) -> u64 {
-        self.0 ^ (self.0 >> 32)
-    }
-
-    fn write(&mut self, bytes: &[u8]) {
-        bytes.iter().for_each(|&b| self.write_u64(u64::from(b)));
-    }
-
-    fn write_u64(&mut self, value: u64) {
-        self.0 = (self.0.rotate_left(23) ^ value).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-    }
-
-    fn write_i64(&mut self, value: i64) {
-        self.write_u64(value as u64);
-    }
-}
-
-type Table<V> = HashMap<(i64, i64, i64), V, BuildHasherDefault<Spread>>;
-
-fn key(p: &Vec3, size: f64) -> Key {
-    std::array::from_fn(|k| (p[k] / size).floor() as i64)
-}
-
-/// Count, sums and second moments of the points of a voxel, about its centre, in units of its size.
-#[derive(Debug, Clone, Copy, Default)]
-struct Sums {
-    n: f64,
-    sum: Vec3,
-    second: Matrix3<f64>,
-}
-
-impl Sums {
-    fn add(&mut self, q: Vec3) {
-        self.n += 1.0;
-        self.sum += q;
-        self.second += q * q.transpose();
-    }
-
-    fn add_shifted(&mut self, other: &Self, d: Vec3) {
-        self.n += other.n;
-        self.sum += other.sum + d * other.n;
-        let cross = other.sum * d.transpose();
-        self.second += other.second + cross + cross.transpose() + d * d.transpose() * other.n;
-    }
-
-    /// Mean and normal; no normal where the points do not look like a surface.
-    fn plane(&self) -> (Vec3, Vec3) {
-        let mean = self.sum / self.n;
-        if self.n < 6.0 {
-            return (mean, Vec3::zeros());
-        }
-        let (variances, axes) = principal(&(self.second / self.n - mean * mean.transpose()));
-        // Thickness below half the width: a voxel neighbourhood across an edge or in a haze has no normal.
-        let surface = variances[0] < 0.25 * variances[1];
-        (mean, if surface { axes.column(0).into() } else { Vec3::zeros() })
-    }
-}
-
-struct Voxels {
-    origin: Vec3,
-    keys: Vec<Key>,
-    table: Table<usize>,
-    sums: Vec<Sums>,
-    order: Vec<usize>,
-    starts: Vec<usize>,
-}
-
-impl Voxels {
-    fn of(points: &[[f64; 3]], size: f64) -> Self {
-        let origin = Vec3::from_fn(|k, _| points.iter().map(|p| p[k]).fold(f64::INFINITY, f64::min));
-        let mut table = Table::default();
-        let (mut keys, mut sums): (Vec<Key>, Vec<Sums>) = (Vec::new(), Vec::new());
-        let mut of_point = Vec::with_capacity(points.len());
-        for p in points {
-            let q = Vec3::from(*p) - origin;
-            let k = key(&q, size);
-            let id = *table.entry((k[0], k[1], k[2])).or_insert_with(|| {
-                keys.push(k);
-                sums.push(Sums::default());
-                keys.len() - 1
-            });
-            sums[id].add(Vec3::from_fn(|i, _| q[i] / size - k[i] as f64 - 0.5));
-            of_point.push(id);
-        }
-        let mut starts = Vec::with_capacity(keys.len());
-        let mut at = 0;
-        for s in &sums {
-            starts.push(at);
-            at += s.n as usize;
-        }
-        let (mut next, mut order) = (starts.clone(), vec![0; points.len()]);
-        for (i, &id) in of_point.iter().enumerate() {
-            order[next[id]] = i;
-            next[id] += 1;
-        }
-        Self { origin, keys, table, sums, order, starts }
-    }
-
-    /// The sums of a voxel and its 26 neighbours.
-    fn merged(&self, id: usize) -> Sums {
-        let k = self.keys[id];
-        let mut all = Sums::default();
-        for x in -1..=1 {
-            for y in -1..=1 {
-                for z in -1..=1 {
-                    let neighbour = (k[0].saturating_add(x), k[1].saturating_add(y), k[2].saturating_add(z));
-                    if let Some(&other) = self.table.get(&neighbour) {
-                        all.add_shifted(&self.sums[other], Vec3::new(x as f64, y as f64, z as f64));
-                    }
-                }
-            }
-        }
-        all
-    }
-}
-
-/// Centres that the cells vote for, in voxels as wide as the radius of the ball in which they must meet.
-struct Votes {
-    size: f64,
-    places: Vec<Vec3>,
-    table: Table<Vec<u32>>,
-}
-
-impl Votes {
-    fn of(cells: &[Cell], radius: f64) -> Self {
-        let mut votes = Self { size: BALL * radius, places: Vec::new(), table: Table::default() };
-        for cell in cells {
-            if cell.points > 0 && cell.normal != Vec3::zeros() {
-                for side in [-1.0, 1.0] {
-                    let place = cell.mean + cell.normal * (side * radius);
-                    let k = key(&place, votes.size);
-                    votes.table.entry((k[0], k[1], k[2])).or_default().push(votes.places.len() as u32);
-                    votes.places.push(place);
-                }
-            }
-        }
-        votes
-    }
-
-    /// Voxels where at least three votes meet, most first.
-    fn peaks(&self) -> Vec<Vec3> {
-        let mut peaks: Vec<(usize, u32)> =
-            self.table.values().filter(|v| v.len() >= 3).map(|v| (v.len(), v[0])).collect();
-        peaks.sort_unstable_by_key(|&(n, first)| (std::cmp::Reverse(n), first));
-        peaks.iter().take(MAX_PEAKS).map(|&(_, first)| self.places[first as usize]).collect()
-    }
-
-    /// The mean of the votes around a place, followed uphill, and their number.
-    fn settle(&self, place: Vec3) -> (Vec3, usize) {
-        let (mut center, mut support) = (place, 0);
-        for _ in 0..3 {
-            let k = key(&center, self.size);
-            let (mut sum, mut n) = (Vec3::zeros(), 0);
-            for x in -1..=1 {
-                for y in -1..=1 {
-                    for z in -1..=1 {
-                        let at = (k[0].saturating_add(x), k[1].saturating_add(y), k[2].saturating_add(z));
-                        for &i in self.table.get(&at).into_iter().flatten() {
-                            let p = self.places[i as usize];
-                            if (p - center).norm() < self.size {
-                                sum += p;
-                                n += 1;
-                            }
-                        }
-                    }
-                }
-            }
-            if n > 0 {
-                center = sum / n as f64;
-            }
-            support = n;
-        }
-        (center, support)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::threads;
 
     /// Uniform in [0, 1) from a counter.
     fn uniform(i: usize) -> f64 {

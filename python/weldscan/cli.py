@@ -158,8 +158,8 @@ def calibrate_hand_eye(
     ),
 ) -> None:
     """Find where the scanner sits on the robot's flange, from shots of the three-sphere plate, and keep it."""
-    from weldscan.calibration.hand_eye import calibrate as solve
-    from weldscan.calibration.hand_eye import write_hand_eye
+    from weldscan.inspection import calibrate_hand_eye as solve
+    from weldscan.session import write_hand_eye
 
     with _progress() as progress:
         found = solve(session, progress)

@@ -171,7 +171,7 @@ def _splat(
     # A point is a dot; the surface between the dots is closed as far as a dot's width.
     filled = cv2.morphologyEx(kind, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     seen = (kind > 0).astype(np.float32)
-    blurred = cv2.GaussianBlur(depth * seen, (0, 0), 1.6) / np.maximum(cv2.GaussianBlur(seen, (0, 0), 1.6), 1e-6)
+    blurred = cv2.GaussianBlur(depth * seen, (0, 0), 2.4) / np.maximum(cv2.GaussianBlur(seen, (0, 0), 2.4), 1e-6)
     slope = [cv2.Sobel(blurred, cv2.CV_32F, dx, dy, scale=1 / 8) for dx, dy in ((1, 0), (0, 1))]
     normal = np.dstack([*slope, np.full(shape, -1, np.float32)])
     light = np.array([-0.35, -0.45, -0.80], np.float32)

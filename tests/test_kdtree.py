@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 import weldscan
-from weldscan import GeometryError, InputError, KdTree
+from weldscan import Follower, GeometryError, InputError, KdTree
 
 
 def brute_force(points, queries):
@@ -61,6 +61,21 @@ def test_a_million_points_as_scipy():
     assert np.allclose(distance, expected, rtol=1e-14, atol=0)  # scipy adds the squares in another order
     d = points[index] - queries
     assert np.array_equal(distance, np.sqrt((d[:, 0] ** 2 + d[:, 1] ** 2) + d[:, 2] ** 2))
+
+
+def test_a_follower_answers_as_a_search():
+    rng = np.random.default_rng(7)
+    points = rng.normal(size=(20_000, 3)) * [30, 30, 1]
+    queries = rng.normal(size=(20_000, 3)) * [30, 30, 1]
+    tree = KdTree(points)
+    follower = Follower(tree)
+    for step in (1, 0.1, 0.01, 0.001, 0):
+        for mine, expected in zip(follower.nearest(queries), tree.nearest(queries), strict=True):
+            assert np.array_equal(mine, expected)
+        queries = queries + rng.normal(size=queries.shape) * step
+    assert np.array_equal(follower.nearest(queries[:9])[1], tree.nearest(queries[:9])[1])
+    with pytest.raises(InputError, match="queries"):
+        follower.nearest([[0, 0, np.nan]])
 
 
 coarse = st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=1, max_size=60)

@@ -9,6 +9,7 @@ __all__ = [
     "Cloud",
     "Cylinder",
     "CylinderFit",
+    "Follower",
     "FoundSphere",
     "KdTree",
     "Lens",
@@ -186,6 +187,11 @@ class KdTree:
     def knn(self, queries: ArrayLike, k: int) -> tuple[NDArray[np.float64], NDArray[np.uint32]]: ...
     def radius(self, queries: ArrayLike, r: float) -> tuple[list[NDArray[np.float64]], list[NDArray[np.uint32]]]: ...
     def __len__(self) -> int: ...
+
+@final
+class Follower:
+    def __new__(cls, tree: KdTree) -> Follower: ...
+    def nearest(self, queries: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.uint32]]: ...
 
 # transform
 @final

@@ -18,7 +18,7 @@ use rayon::prelude::*;
 use crate::Vec3;
 use crate::distance::{Surface, Target};
 use crate::error::{Error, Result, require_count, require_finite, require_positive};
-use crate::kdtree::{Aside, KdTree, Step};
+use crate::kdtree::{Aside, KdTree, Step, order_along};
 use crate::mesh::Mesh;
 use crate::threads;
 use crate::transform::Transform;
@@ -258,8 +258,12 @@ struct Rounds<'a> {
 
 impl<'a> Rounds<'a> {
     fn new(all: &[[f64; 3]], wanted: usize, target: &'a Target<'a>, options: &'a Options) -> Self {
-        let chosen = spread(all.len(), wanted);
-        let source: Vec<[f64; 3]> = chosen.iter().filter_map(|&i| all.get(i as usize).copied()).collect();
+        let mut chosen = spread(all.len(), wanted);
+        let mut source: Vec<[f64; 3]> = chosen.iter().filter_map(|&i| all.get(i as usize).copied()).collect();
+        if let Some(order) = threads::install(|| order_along(&source)) {
+            source = order.iter().filter_map(|&i| source.get(i as usize).copied()).collect();
+            chosen = order.iter().filter_map(|&i| chosen.get(i as usize).copied()).collect();
+        }
         let n = source.len() as f64;
         let start = source.first().map_or(Vec3::zeros(), |p| Vec3::from(*p));
         let offsets = |from: Vec3| source.iter().map(move |p| Vec3::from(*p) - from);
@@ -388,6 +392,7 @@ impl<'a> Rounds<'a> {
             .filter(|((p, m), _)| self.kernel.weight(self.residual(&pose.apply(p), m)) > 0.0)
             .map(|(_, &index)| index)
             .collect();
+        answer.inliers.sort_unstable();
         let center = pose.apply(&self.centroid);
         let eigen = equations.eigen()?;
         // From scaled rotation and translation about the centroid to radians and millimetres about the origin.
@@ -516,11 +521,9 @@ fn to_cloud(
     let mut aside = Aside::new();
     for ((p, step), found) in source.iter().zip(steps).zip(matches) {
         let moved = pose.apply(&as_vector(p));
-        let (squared, place) = tree.follow(&[moved.x, moved.y, moved.z], step, &mut aside);
-        let (point, index) = tree.in_place(place);
-        found.point = point.into();
-        found.distance = squared.sqrt();
-        if let Some(normal) = normals.and_then(|n| n.get(index as usize)) {
+        found.distance = tree.follow(&[moved.x, moved.y, moved.z], step, &mut aside).sqrt();
+        found.point = step.point.into();
+        if let Some(normal) = normals.and_then(|n| n.get(step.index as usize)) {
             found.normal = as_vector(normal);
             if normal[0].is_nan() {
                 found.distance = f64::INFINITY;

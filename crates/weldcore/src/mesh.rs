@@ -15,7 +15,7 @@ use rayon::prelude::*;
 use crate::Vec3;
 use crate::distance::Foot;
 use crate::error::{Error, Result, require_count, require_finite};
-use crate::kdtree::{Aside, BoxTree, Extent, Item, Visit, max, min, order};
+use crate::kdtree::{Aside, BoxTree, Extent, Item, Visit, WIDTH, at_most, for_chunks, max, min, order};
 use crate::threads;
 
 /// Coordinates beyond this would overflow in the products of a projection.
@@ -28,6 +28,8 @@ const CHUNK: usize = 1024;
 #[derive(Clone)]
 pub struct Mesh {
     boxes: BoxTree,
+    /// The faces eight by eight, coordinate by coordinate, to find the nearest.
+    leaves: Vec<Leaf>,
     /// In the tree's order.
     faces: Vec<Face>,
     vertices: usize,
@@ -115,15 +117,17 @@ impl Mesh {
         }
         let flat = triangles - faces.len();
         let open_edges = on_rim.iter().filter(|&&rim| rim).count();
-        let (boxes, faces) = threads::install(|| {
+        let (boxes, leaves, faces) = threads::install(|| {
             let mut items: Vec<Item> = (faces.iter().enumerate())
                 .map(|(i, f)| Item { at: f.triangle.center().to_array(), index: i as u32 })
                 .collect();
             order(&mut items);
             let faces: Vec<Face> = items.iter().map(|i| faces[i.index as usize].clone()).collect();
-            (BoxTree::new(&faces, Face::extent), faces)
+            let leaves: Vec<Leaf> = faces.par_chunks(WIDTH).map(Leaf::new).collect();
+            let eights: Vec<&[Face]> = faces.chunks(WIDTH).collect();
+            (BoxTree::new(&eights, |eight| around(eight)), leaves, faces)
         });
-        Some(Self { boxes, faces, vertices, flat, open_edges, unoriented })
+        Some(Self { boxes, leaves, faces, vertices, flat, open_edges, unoriented })
     }
 
     /// How many vertices were given.
@@ -187,7 +191,7 @@ impl Mesh {
         feet_of(self, points, false, out, &put);
     }
 
-    fn each_foot<T: Send>(
+    fn each_foot<T: Send + Sync + Copy>(
         &self,
         points: &[[f64; 3]],
         signed: bool,
@@ -198,11 +202,7 @@ impl Mesh {
         if signed {
             self.require_sides()?;
         }
-        threads::install(|| {
-            (points.par_chunks(CHUNK), out.par_chunks_mut(CHUNK))
-                .into_par_iter()
-                .for_each(|(points, out)| feet_of(self, points, signed, out, &put));
-        });
+        threads::install(|| for_chunks(points, out, CHUNK, |points, out| feet_of(self, points, signed, out, &put)));
         Ok(())
     }
 }
@@ -241,26 +241,82 @@ impl Face {
     }
 }
 
-/// The nearest place of a mesh so far.
-struct NearestFace<'a> {
-    faces: &'a [Face],
-    q: Vector,
-    squared: f64,
-    face: usize,
-    point: Vector,
-    location: TrianglePointLocation,
-}
-
-impl NearestFace<'_> {
-    #[inline(always)]
-    fn look_at(&mut self, face: usize) {
-        let (projection, location) = self.faces[face].triangle.project_local_point_and_get_location(self.q, false);
-        let offset = self.q - projection.point;
-        let squared = (offset.x * offset.x + offset.y * offset.y) + offset.z * offset.z;
-        if squared < self.squared {
-            (self.squared, self.face, self.point, self.location) = (squared, face, projection.point, location);
+/// The box around some faces.
+fn around(faces: &[Face]) -> Extent {
+    let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+    for (l, h) in faces.iter().map(Face::extent) {
+        for k in 0..3 {
+            (low[k], high[k]) = (min(low[k], l[k]), max(high[k], h[k]));
         }
     }
+    (low, high)
+}
+
+/// Eight faces: corners a, b, c, unit normal, and one over the squared lengths of ab, bc, ca.
+#[derive(Clone)]
+#[repr(C, align(64))]
+struct Leaf([[f64; WIDTH]; 15]);
+
+impl Leaf {
+    fn new(faces: &[Face]) -> Self {
+        let mut rows = [[f64::NAN; WIDTH]; 15];
+        for (place, face) in faces.iter().enumerate() {
+            let Triangle { a, b, c } = face.triangle;
+            for (row, value) in [a, b, c, face.normal].iter().flat_map(|v| v.to_array()).enumerate() {
+                rows[row][place] = value;
+            }
+            for (row, side) in [b - a, c - b, a - c].iter().enumerate() {
+                rows[12 + row][place] = 1.0 / side.length_squared();
+            }
+        }
+        Self(rows)
+    }
+
+    /// By cases without branches: the distance from the plane where the foot is inside, else from the nearest edge.
+    #[inline(always)]
+    fn squared_distances(&self, q: &[f64; 3]) -> [f64; WIDTH] {
+        let mut squared = [0.0; WIDTH];
+        for (i, squared) in squared.iter_mut().enumerate() {
+            let v = |row: usize| [self.0[row][i], self.0[row + 1][i], self.0[row + 2][i]];
+            let (a, b, c, n) = (v(0), v(3), v(6), v(9));
+            let (pa, pb, pc) = (minus(q, &a), minus(q, &b), minus(q, &c));
+            let (ab, bc, ca) = (minus(&b, &a), minus(&c, &b), minus(&a, &c));
+            let edge = |side: &[f64; 3], p: &[f64; 3], inverse: f64| {
+                let t = min(max(dot(side, p) * inverse, 0.0), 1.0);
+                let off = [p[0] - side[0] * t, p[1] - side[1] * t, p[2] - side[2] * t];
+                dot(&off, &off)
+            };
+            let inside = |side: &[f64; 3], p: &[f64; 3]| dot(&cross(&n, side), p) >= 0.0;
+            let height = dot(&n, &pa);
+            let edges =
+                min(edge(&ab, &pa, self.0[12][i]), min(edge(&bc, &pb, self.0[13][i]), edge(&ca, &pc, self.0[14][i])));
+            *squared = if inside(&ab, &pa) & inside(&bc, &pb) & inside(&ca, &pc) { height * height } else { edges };
+        }
+        squared
+    }
+}
+
+#[inline(always)]
+fn minus(a: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+}
+
+#[inline(always)]
+fn dot(a: &[f64; 3], b: &[f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+#[inline(always)]
+fn cross(a: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+/// The nearest face so far.
+struct NearestFace<'a> {
+    leaves: &'a [Leaf],
+    q: [f64; 3],
+    squared: f64,
+    face: usize,
 }
 
 impl Visit for NearestFace<'_> {
@@ -270,35 +326,39 @@ impl Visit for NearestFace<'_> {
     }
 
     #[inline(always)]
-    fn visit(&mut self, child: usize) {
-        self.look_at(child);
+    fn visit(&mut self, leaf: usize) {
+        let distances = self.leaves[leaf].squared_distances(&self.q);
+        let mut near = at_most(&distances, self.squared);
+        while near != 0 {
+            let place = near.trailing_zeros() as usize & (WIDTH - 1);
+            near &= near - 1;
+            if distances[place] < self.squared {
+                (self.squared, self.face) = (distances[place], leaf * WIDTH + place);
+            }
+        }
     }
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
 fn feet_of<T>(mesh: &Mesh, points: &[[f64; 3]], signed: bool, out: &mut [T], put: &(impl Fn(&mut T, Foot) + Sync)) {
     let mut aside = Aside::new();
-    let mut last = 0;
     for (p, out) in points.iter().zip(out) {
-        let q = Vector::from_array(*p);
-        let location = TrianglePointLocation::OnSolid;
-        let mut found =
-            NearestFace { faces: &mesh.faces, q, squared: f64::MAX, face: 0, point: Vector::ZERO, location };
-        // Points come in some order: the last one's face is often a good start, and the boxes' guess never a bad one.
-        found.look_at(last);
-        found.look_at(mesh.boxes.dive(p));
+        let mut found = NearestFace { leaves: &mesh.leaves, q: *p, squared: f64::MAX, face: 0 };
+        found.visit(mesh.boxes.dive(p));
         mesh.boxes.search(p, &mut aside, &mut found);
-        last = found.face;
         let face = &mesh.faces[found.face];
-        let distance = found.squared.sqrt();
-        let side = if signed { face.side(found.location) } else { Vector::ZERO };
-        let distance = match (q - found.point).dot(side) {
+        let q = Vector::from_array(*p);
+        let (projection, location) = face.triangle.project_local_point_and_get_location(q, false);
+        let offset = q - projection.point;
+        let distance = offset.length();
+        let side = if signed { face.side(location) } else { Vector::ZERO };
+        let distance = match offset.dot(side) {
             _ if !signed || distance == 0.0 => distance,
             _ if side == Vector::ZERO => f64::NAN,
             behind if behind < 0.0 => -distance,
             _ => distance,
         };
-        put(out, Foot { distance, point: vec3(found.point), normal: vec3(face.normal) });
+        put(out, Foot { distance, point: vec3(projection.point), normal: vec3(face.normal) });
     }
 }
 

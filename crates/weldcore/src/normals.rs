@@ -10,7 +10,7 @@ use crate::threads;
 /// Rows of the grid handed to a thread at a time.
 const ROWS: usize = 16;
 /// Pixels of a row treated side by side, so that their sums stay in the nearest cache.
-const SIDE_BY_SIDE: usize = 64;
+const SIDE_BY_SIDE: usize = 32;
 /// Neighbours this many times further apart than pixels commonly are lie across a jump: a surface seen so obliquely
 /// (beyond 75°) that its own pixels were that far apart is not measured.
 const JUMP: f64 = 4.0;
@@ -73,8 +73,68 @@ struct Grid<'a> {
     viewpoint: [f64; 3],
 }
 
-/// Sums over the window of pixels that lie side by side: of 1, i, j, ii, ij, jj, p, i p, j p.
-type Sums = [[f64; SIDE_BY_SIDE]; 15];
+/// A coordinate of pixels that lie side by side.
+type Lanes = [f64; SIDE_BY_SIDE];
+/// Sums for each of them over a row of its window: of 1, j, jj, p, j p.
+type RowSums = [Lanes; 9];
+/// And over the whole window: of 1, i, j, ii, ij, jj, p, i p, j p.
+type Sums = [Lanes; 15];
+
+#[inline(always)]
+fn side_by_side(planes: [&Vec<f64>; 3], from: usize) -> Option<[&Lanes; 3]> {
+    let [x, y, z] = planes.map(|plane| plane.get(from..).and_then(|p| p.first_chunk()));
+    Some([x?, y?, z?])
+}
+
+#[inline(always)]
+fn add_pixels(sums: &mut RowSums, [cx, cy, cz]: [&Lanes; 3], [px, py, pz]: [&Lanes; 3], j: f64, jump: f64) {
+    let [n, nj, njj, sx, sy, sz, jx, jy, jz] = sums;
+    for k in 0..SIDE_BY_SIDE {
+        // Relative to the pixel's own point: no cancellation far from the origin.
+        let (x, y, z) = (px[k] - cx[k], py[k] - cy[k], pz[k] - cz[k]);
+        // False for NaN.
+        let counts = x * x + y * y + z * z <= jump;
+        let of = |v: f64| if counts { v } else { 0.0 };
+        let (x, y, z) = (of(x), of(y), of(z));
+        n[k] += of(1.0);
+        nj[k] += of(j);
+        njj[k] += of(j * j);
+        sx[k] += x;
+        sy[k] += y;
+        sz[k] += z;
+        jx[k] += j * x;
+        jy[k] += j * y;
+        jz[k] += j * z;
+    }
+}
+
+#[inline(always)]
+fn add_row(sums: &mut Sums, of_row: &RowSums, i: f64) {
+    let [n, nj, njj, sx, sy, sz, jx, jy, jz] = of_row;
+    // Each sum of the window is one of the row times a power of i.
+    let parts: [(&Lanes, f64); 15] = [
+        (n, 1.0),
+        (n, i),
+        (nj, 1.0),
+        (n, i * i),
+        (nj, i),
+        (njj, 1.0),
+        (sx, 1.0),
+        (sy, 1.0),
+        (sz, 1.0),
+        (sx, i),
+        (sy, i),
+        (sz, i),
+        (jx, 1.0),
+        (jy, 1.0),
+        (jz, 1.0),
+    ];
+    for (sum, (part, factor)) in sums.iter_mut().zip(parts) {
+        for (s, p) in sum.iter_mut().zip(part) {
+            *s += factor * p;
+        }
+    }
+}
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
 fn of_strip(grid: &Grid, first: usize, normals: &mut [[f64; 3]]) {
@@ -99,41 +159,21 @@ fn of_strip(grid: &Grid, first: usize, normals: &mut [[f64; 3]]) {
         let row = first + r;
         let (low, high) = (row.saturating_sub(reach).max(top), (row + reach + 1).min(bottom));
         for (block, normals) in normals.chunks_mut(SIDE_BY_SIDE).enumerate() {
-            let here = (row - top) * stride + reach + block * SIDE_BY_SIDE;
+            let left = block * SIDE_BY_SIDE;
+            let here = (row - top) * stride + left + reach;
+            let Some(centre) = side_by_side([xs, ys, zs], here) else { continue };
             let mut sums: Sums = [[0.0; SIDE_BY_SIDE]; 15];
             for near in low..high {
                 let i = near as f64 - row as f64;
+                let mut of_row: RowSums = [[0.0; SIDE_BY_SIDE]; 9];
                 for shift in 0..=2 * reach {
                     let j = shift as f64 - reach as f64;
-                    let there = (near - top) * stride + block * SIDE_BY_SIDE + shift;
-                    let jump = (grid.jump * grid.jump) * (i * i + j * j);
-                    let at = |plane: &'_ [f64], from: usize| -> [f64; SIDE_BY_SIDE] {
-                        std::array::from_fn(|k| plane[from..from + SIDE_BY_SIDE][k])
+                    let Some(there) = side_by_side([xs, ys, zs], (near - top) * stride + left + shift) else {
+                        continue;
                     };
-                    let (px, py, pz) = (at(xs, there), at(ys, there), at(zs, there));
-                    let (cx, cy, cz) = (at(xs, here), at(ys, here), at(zs, here));
-                    for k in 0..SIDE_BY_SIDE {
-                        // Relative to the pixel's own point: no cancellation far from the origin.
-                        let (x, y, z) = (px[k] - cx[k], py[k] - cy[k], pz[k] - cz[k]);
-                        let counts = x * x + y * y + z * z <= jump;
-                        let (w, x, y, z) = if counts { (1.0, x, y, z) } else { (0.0, 0.0, 0.0, 0.0) };
-                        sums[0][k] += w;
-                        sums[1][k] += w * i;
-                        sums[2][k] += w * j;
-                        sums[3][k] += w * (i * i);
-                        sums[4][k] += w * (i * j);
-                        sums[5][k] += w * (j * j);
-                        sums[6][k] += x;
-                        sums[7][k] += y;
-                        sums[8][k] += z;
-                        sums[9][k] += i * x;
-                        sums[10][k] += i * y;
-                        sums[11][k] += i * z;
-                        sums[12][k] += j * x;
-                        sums[13][k] += j * y;
-                        sums[14][k] += j * z;
-                    }
+                    add_pixels(&mut of_row, centre, there, j, (grid.jump * grid.jump) * (i * i + j * j));
                 }
+                add_row(&mut sums, &of_row, i);
             }
             for (k, normal) in normals.iter_mut().enumerate() {
                 let s = |n: usize| sums[n][k];

@@ -16,9 +16,11 @@ use rayon::prelude::*;
 use crate::error::{Error, Result, require_count, require_finite};
 use crate::threads;
 
+mod along;
 mod boxes;
 
-pub(crate) use boxes::{Aside, BoxTree, Extent, Item, Visit, WIDTH, max, min, order};
+pub(crate) use along::{for_chunks, order_along};
+pub(crate) use boxes::{Aside, BoxTree, Extent, Item, Visit, WIDTH, at_most, max, min, order};
 
 /// Queries handed to a thread at a time.
 const QUERIES: usize = 1024;
@@ -106,24 +108,18 @@ impl KdTree {
     /// [`Error::NonFinite`] and [`Error::OutOfRange`] as in [`KdTree::new`].
     pub fn nearest(&self, queries: &[[f64; 3]]) -> Result<(Vec<f64>, Vec<u32>)> {
         require_range("queries", queries)?;
-        let (mut distance, mut index) = (vec![0.0; queries.len()], vec![0; queries.len()]);
-        threads::install(|| {
-            (queries.par_chunks(QUERIES), distance.par_chunks_mut(QUERIES), index.par_chunks_mut(QUERIES))
-                .into_par_iter()
-                .for_each(|(queries, distance, index)| nearest_of(self, queries, distance, index));
-        });
-        Ok((distance, index))
+        let mut found = vec![Nearest { squared: FAR, index: u32::MAX }; queries.len()];
+        Ok(threads::install(|| {
+            for_chunks(queries, &mut found, QUERIES, |queries, found| nearest_of(self, queries, found));
+            found.par_iter().map(|f| (f.squared.sqrt(), f.index)).unzip()
+        }))
     }
 
     /// The distance of the nearest point to each query, mm, negative where the query is behind that point's normal.
     pub(crate) fn signed(&self, queries: &[[f64; 3]], normals: &[[f64; 3]]) -> Result<Vec<f64>> {
         require_range("points", queries)?;
         let mut distance = vec![0.0; queries.len()];
-        threads::install(|| {
-            (queries.par_chunks(QUERIES), distance.par_chunks_mut(QUERIES))
-                .into_par_iter()
-                .for_each(|(queries, distance)| signed_of(self, normals, queries, distance));
-        });
+        threads::install(|| for_chunks(queries, &mut distance, QUERIES, |q, d| signed_of(self, normals, q, d)));
         Ok(distance)
     }
 
@@ -174,26 +170,27 @@ impl KdTree {
         (self.leaves[leaf].0.map(|row| row[i]), self.indices[leaf][i])
     }
 
-    /// The place of the nearest point to `q`, and the squared distance. Starts from what `step` knows of the last query:
-    /// a query that has moved by less than half of the lead of its nearest point over the second nearest needs no search.
+    /// Brings `step` up to date: its nearest point to `q`; the squared distance is returned. A query that has moved by less
+    /// than half of the lead of its nearest point over the second nearest needs no search, and does not touch the tree.
     #[inline(always)]
-    pub(crate) fn follow(&self, q: &[f64; 3], step: &mut Step, aside: &mut Aside) -> (f64, u32) {
+    pub(crate) fn follow(&self, q: &[f64; 3], step: &mut Step, aside: &mut Aside) -> f64 {
         let mut found = NearestTwo { squared: FAR, second: FAR, index: u32::MAX, place: 0 };
         if step.place == NOWHERE {
             self.offer_leaf(self.boxes.dive(q), q, &mut found);
         } else {
-            let (p, index) = self.in_place(step.place);
-            let squared = squared_distance(&p, q);
+            let squared = squared_distance(&step.point, q);
             if 2.0 * squared_distance(&step.at, q).sqrt() < step.lead {
-                return (squared, step.place);
+                return squared;
             }
-            found.offer(squared, index, step.place);
+            found.offer(squared, step.index, step.place);
         }
         self.search(q, aside, &mut found);
         let (first, second) = (found.squared.sqrt(), found.second.sqrt());
         // Less what rounding could make of the distances compared.
-        *step = Step { at: *q, lead: second - first - ROUNDING * second, place: found.place };
-        (found.squared, found.place)
+        let lead = second - first - ROUNDING * second;
+        let (point, index) = self.in_place(found.place);
+        *step = Step { at: *q, lead, point, index, place: found.place };
+        found.squared
     }
 
     /// How many places the tree has: its points, and blanks in the last leaf with an index beyond the points.
@@ -219,7 +216,7 @@ impl KdTree {
     #[inline(always)]
     fn offer_leaf(&self, leaf: usize, q: &[f64; 3], found: &mut impl Found) {
         let distances = self.leaves[leaf].squared_distances(q);
-        let mut near = boxes::at_most(&distances, found.bound());
+        let mut near = at_most(&distances, found.bound());
         while near != 0 {
             let place = near.trailing_zeros() as usize & (WIDTH - 1);
             near &= near - 1;
@@ -233,27 +230,44 @@ impl KdTree {
 /// It remembers for each query by how much its nearest point is nearer than the second nearest: as long as the query
 /// moves by less than half of that, the answer stands without a search. Answers are those of [`KdTree::nearest`].
 #[derive(Clone, Default)]
-pub struct Follower(Vec<Step>);
+pub struct Follower {
+    /// The order in which the queries are gone through, where it is not theirs.
+    order: Option<Vec<u32>>,
+    steps: Vec<Step>,
+}
 
 impl Follower {
-    /// As [`KdTree::nearest`]. The queries are taken for those of the last call, moved; another number of them starts anew.
+    /// As [`KdTree::nearest`], of the same tree in every call. The queries are taken for those of the last call, moved;
+    /// another number of them starts anew.
     ///
     /// # Errors
     /// As [`KdTree::nearest`].
     pub fn nearest(&mut self, tree: &KdTree, queries: &[[f64; 3]]) -> Result<(Vec<f64>, Vec<u32>)> {
         require_range("queries", queries)?;
-        let places = u32::try_from(tree.leaves.len() * WIDTH).unwrap_or(u32::MAX);
-        if self.0.len() != queries.len() || self.0.iter().any(|s| s.place != NOWHERE && s.place >= places) {
-            self.0 = vec![Step::NEW; queries.len()];
-        }
-        let (mut distance, mut index) = (vec![0.0; queries.len()], vec![0; queries.len()]);
-        threads::install(|| {
-            let answers = (distance.par_chunks_mut(QUERIES), index.par_chunks_mut(QUERIES));
-            (queries.par_chunks(QUERIES), self.0.par_chunks_mut(QUERIES), answers.0, answers.1)
-                .into_par_iter()
-                .for_each(|(queries, steps, distance, index)| follow_all(tree, queries, steps, distance, index));
-        });
-        Ok((distance, index))
+        Ok(threads::install(|| {
+            if self.steps.len() != queries.len() {
+                self.steps = vec![Step::NEW; queries.len()];
+                self.order = order_along(queries);
+            }
+            let mut found = vec![(0.0, 0); queries.len()];
+            let steps = &mut self.steps;
+            let run = |queries: &[[f64; 3]], steps: &mut Vec<Step>, found: &mut [(f64, u32)]| {
+                (queries.par_chunks(QUERIES), steps.par_chunks_mut(QUERIES), found.par_chunks_mut(QUERIES))
+                    .into_par_iter()
+                    .for_each(|(queries, steps, found)| follow_all(tree, queries, steps, found));
+            };
+            let Some(order) = &self.order else {
+                run(queries, steps, &mut found);
+                return found.into_par_iter().unzip();
+            };
+            let ordered: Vec<[f64; 3]> = order.par_iter().map(|&i| queries[i as usize]).collect();
+            run(&ordered, steps, &mut found);
+            let (mut distance, mut index) = (vec![0.0; queries.len()], vec![0; queries.len()]);
+            for (&i, (d, n)) in order.iter().zip(found) {
+                (distance[i as usize], index[i as usize]) = (d, n);
+            }
+            (distance, index)
+        }))
     }
 }
 
@@ -299,6 +313,7 @@ impl<F: Found> Visit for Leaves<'_, F> {
 }
 
 /// The nearest.
+#[derive(Clone, Copy)]
 struct Nearest {
     squared: f64,
     index: u32,
@@ -417,12 +432,15 @@ pub(crate) struct Step {
     at: [f64; 3],
     /// How much nearer its nearest point was than the second nearest, mm.
     lead: f64,
+    /// Its nearest point.
+    pub(crate) point: [f64; 3],
+    pub(crate) index: u32,
     place: u32,
 }
 
 impl Step {
     /// Of a query that was never searched.
-    pub(crate) const NEW: Self = Self { at: [0.0; 3], lead: 0.0, place: NOWHERE };
+    pub(crate) const NEW: Self = Self { at: [0.0; 3], lead: 0.0, point: [0.0; 3], index: u32::MAX, place: NOWHERE };
 }
 
 /// The `k` nearest, ascending.
@@ -479,13 +497,11 @@ impl Found for WithinRadius {
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
-fn nearest_of(tree: &KdTree, queries: &[[f64; 3]], distance: &mut [f64], index: &mut [u32]) {
+fn nearest_of(tree: &KdTree, queries: &[[f64; 3]], found: &mut [Nearest]) {
     let mut aside = Aside::new();
-    for ((q, distance), index) in queries.iter().zip(distance).zip(index) {
-        let mut found = Nearest { squared: FAR, index: u32::MAX };
-        tree.offer_leaf(tree.boxes.dive(q), q, &mut found);
-        tree.search(q, &mut aside, &mut found);
-        (*distance, *index) = (found.squared.sqrt(), found.index);
+    for (q, found) in queries.iter().zip(found) {
+        tree.offer_leaf(tree.boxes.dive(q), q, found);
+        tree.search(q, &mut aside, found);
     }
 }
 
@@ -493,19 +509,20 @@ fn nearest_of(tree: &KdTree, queries: &[[f64; 3]], distance: &mut [f64], index: 
 fn signed_of(tree: &KdTree, normals: &[[f64; 3]], queries: &[[f64; 3]], distance: &mut [f64]) {
     let mut aside = Aside::new();
     for (q, distance) in queries.iter().zip(distance) {
-        let (squared, place) = tree.follow(q, &mut Step::NEW.clone(), &mut aside);
-        let (p, index) = tree.in_place(place);
-        let ahead = normals.get(index as usize).map_or(0.0, |n| (0..3).map(|k| n[k] * (q[k] - p[k])).sum::<f64>());
+        let mut step = Step::NEW;
+        let squared = tree.follow(q, &mut step, &mut aside);
+        let (p, normal) = (step.point, normals.get(step.index as usize));
+        let ahead = normal.map_or(0.0, |n| (0..3).map(|k| n[k] * (q[k] - p[k])).sum::<f64>());
         *distance = if ahead < 0.0 { -squared.sqrt() } else { squared.sqrt() };
     }
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
-fn follow_all(tree: &KdTree, queries: &[[f64; 3]], steps: &mut [Step], distance: &mut [f64], index: &mut [u32]) {
+fn follow_all(tree: &KdTree, queries: &[[f64; 3]], steps: &mut [Step], found: &mut [(f64, u32)]) {
     let mut aside = Aside::new();
-    for (((q, step), distance), index) in queries.iter().zip(steps).zip(distance).zip(index) {
-        let (squared, place) = tree.follow(q, step, &mut aside);
-        (*distance, *index) = (squared.sqrt(), tree.in_place(place).1);
+    for ((q, step), found) in queries.iter().zip(steps).zip(found) {
+        let squared = tree.follow(q, step, &mut aside);
+        *found = (squared.sqrt(), step.index);
     }
 }
 

@@ -1,12 +1,14 @@
 //! The k-d tree as Python sees it.
 
+use std::sync::{Mutex, PoisonError};
+
 use numpy::ndarray::Array2;
 use numpy::{IntoPyArray, PyArray1, PyArray2};
 use pyo3::prelude::*;
 
 use super::{compute, float_matrix, points, raise};
 use crate::error::Error;
-use crate::kdtree::KdTree;
+use crate::kdtree::{Follower, KdTree};
 
 type Pair<'py, A> = (Bound<'py, A>, Bound<'py, PyArray1<u32>>);
 type Lists<'py> = (Vec<Bound<'py, PyArray1<f64>>>, Vec<Bound<'py, PyArray1<u32>>>);
@@ -141,6 +143,65 @@ impl PyKdTree {
     }
 }
 
+/// Nearest neighbours of queries that move a little from call to call, as the points of an iteration do.
+///
+/// It remembers by how much the nearest point of each query is nearer than the second nearest: as long as a query has
+/// moved by less than half of that, the answer stands without a search. Answers are those of `KdTree.nearest`.
+///
+/// Args:
+///     tree: a `KdTree`.
+///
+/// Example:
+///     >>> import numpy as np
+///     >>> from weldscan import Follower, KdTree
+///     >>> follower = Follower(KdTree([[0, 0, 0], [2, 0, 0]]))
+///     >>> for x in (0.0, 0.1, 1.9):
+///     ...     distance, index = follower.nearest([[x, 0, 0]])
+///     >>> index.tolist()
+///     [1]
+#[pyclass(frozen, module = "weldscan", name = "Follower")]
+pub(crate) struct PyFollower {
+    tree: Py<PyKdTree>,
+    follower: Mutex<Follower>,
+}
+
+#[pymethods]
+impl PyFollower {
+    #[new]
+    fn new(tree: Py<PyKdTree>) -> Self {
+        Self { tree, follower: Mutex::default() }
+    }
+
+    /// The nearest point to each query, as `KdTree.nearest`. The queries are taken for those of the last call, moved;
+    /// another number of them starts anew.
+    ///
+    /// Args:
+    ///     queries: (m, 3), mm, in the frame of the points.
+    ///
+    /// Returns:
+    ///     distance: (m,) float64, mm.
+    ///     index: (m,) uint32, into the points; the lowest of equally distant ones.
+    ///
+    /// Raises:
+    ///     InputError: a wrong shape; NaN, infinity or a coordinate beyond 1e150.
+    ///
+    /// Example:
+    ///     >>> from weldscan import Follower, KdTree
+    ///     >>> Follower(KdTree([[0, 0, 0], [2, 0, 0]])).nearest([[1.5, 0, 0]])
+    ///     (array([0.5]), array([1], dtype=uint32))
+    fn nearest<'py>(&self, py: Python<'py>, queries: &Bound<'py, PyAny>) -> PyResult<Pair<'py, PyArray1<f64>>> {
+        let array = float_matrix("queries", queries)?;
+        let queries = points("queries", &array)?;
+        let tree = &self.tree.get().tree;
+        let (distance, index) = compute(py, || {
+            // What a call that failed left behind is as good as any start.
+            self.follower.lock().unwrap_or_else(PoisonError::into_inner).nearest(tree, queries)
+        })?;
+        Ok((distance.into_pyarray(py), index.into_pyarray(py)))
+    }
+}
+
 pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_class::<PyKdTree>()
+    m.add_class::<PyKdTree>()?;
+    m.add_class::<PyFollower>()
 }

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
+import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -356,6 +358,24 @@ def test_the_sphere_through_four_points() -> None:
         weldscan.sphere_through_points([[0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]])
     with pytest.raises(weldscan.InputError, match="4 points"):
         weldscan.sphere_through_points(np.eye(3))
+
+
+def test_another_thread_runs_meanwhile() -> None:
+    points = cap(np.random.default_rng(0), 200_000, 10, 1.0)
+    ticks, done = [], threading.Event()
+
+    def tick() -> None:
+        while not done.wait(0.001):
+            ticks.append(time.perf_counter())
+
+    other = threading.Thread(target=tick)
+    other.start()
+    start = time.perf_counter()
+    weldscan.fit_sphere(points, robust=True)
+    end = time.perf_counter()
+    done.set()
+    other.join()
+    assert sum(start < t < end for t in ticks) >= 2
 
 
 FITS: list[Callable[..., Any]] = [weldscan.fit_plane, weldscan.fit_sphere, weldscan.fit_cylinder]

@@ -125,7 +125,9 @@ def demo(
         "weldscan-demo"
     ),
     live: Annotated[
+        bool,
         bool, typer.Option("--live", help="Scan it as a live cell: robot over a socket, camera and projector.")
+        typer.Option("--live", help="Scan it as a live cell: robot over a socket, camera, projector, shot by shot."),
     ] = False,
 ) -> None:
     """Simulate a cell (scanner, robot, three-sphere plate, welded pipe), record a session and inspect it."""

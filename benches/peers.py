@@ -159,7 +159,7 @@ def triangulating() -> Iterator[Job]:
     def agree(ours: Any, theirs: np.ndarray) -> None:
         for found in (ours.points_mm, theirs):
             assert np.nanmax(np.abs(found.reshape(-1, 3) - truth)) < 1e-6
-        assert np.isfinite(ours.points_mm).mean() > 0.9
+        assert np.isfinite(ours.points_mm).mean() > 0.5
 
     yield Job(
         "triangulate 1.23 million pixels, both lenses",

@@ -126,7 +126,6 @@ def demo(
     ),
     live: Annotated[
         bool,
-        bool, typer.Option("--live", help="Scan it as a live cell: robot over a socket, camera and projector.")
         typer.Option("--live", help="Scan it as a live cell: robot over a socket, camera, projector, shot by shot."),
     ] = False,
 ) -> None:
@@ -160,7 +159,7 @@ def calibrate_hand_eye(
     ),
 ) -> None:
     """Find where the scanner sits on the robot's flange, from shots of the three-sphere plate, and keep it."""
-    from weldscan.inspection import calibrate_hand_eye as solve
+    from weldscan.calibration.hand_eye import calibrate as solve
     from weldscan.session import write_hand_eye
 
     with _progress() as progress:

@@ -36,6 +36,7 @@ pub mod fit;
 pub mod icp;
 pub mod image;
 pub mod kdtree;
+mod memory;
 pub mod mesh;
 pub mod normals;
 pub mod phase;

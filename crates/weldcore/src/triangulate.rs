@@ -9,6 +9,7 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
+use crate::memory::zeros;
 use crate::scanner::{Lens, Rays, Scanner};
 use crate::threads::{self, CHUNK};
 
@@ -177,8 +178,8 @@ pub fn triangulate(column_px: &[f64], scanner: &Scanner, sigma_px: Option<&[f32]
     }
     let problem = Problem::new(scanner, axis);
     let rays = scanner.camera_rays();
-    let mut points_mm = vec![[0.0; 3]; n];
-    let mut sigma_mm = vec![0.0f32; if sigma_px.is_some() { n } else { 0 }];
+    let mut points_mm = zeros::<[f64; 3]>(n);
+    let mut sigma_mm = zeros::<f32>(if sigma_px.is_some() { n } else { 0 });
     threads::install(|| match sigma_px {
         Some(sigma_px) => {
             let out = points_mm.par_chunks_mut(CHUNK).zip(sigma_mm.par_chunks_mut(CHUNK)).enumerate();

@@ -20,13 +20,14 @@ use rayon::prelude::*;
 
 pub use noise::{Noise, NoiseSource};
 pub use wave::Level;
-pub(crate) use wave::round64;
+pub(crate) use wave::{round, round64};
 pub use wrapped::{WrappedPhase, decode_phase};
 
 use crate::error::{Error, Result, require_positive};
+use crate::memory::zeros;
 use crate::threads::{self, CHUNK};
 use crate::unwrap::Plan;
-use wave::{Lane, Sinusoid, TILE, Wave, round, turns};
+use wave::{Lane, Sinusoid, TILE, Wave, turns};
 
 /// N steps of one frequency.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -164,11 +165,11 @@ pub fn decode_shot<T: Level>(
     let mut map = PhaseMap {
         width: shot.width,
         height: shot.height,
-        column_px: vec![0.0; n],
-        sigma_px: vec![0.0; n],
-        modulation: vec![0.0; n],
-        background: vec![0.0; n],
-        reason: vec![0; n],
+        column_px: zeros(n),
+        sigma_px: zeros(n),
+        modulation: zeros(n),
+        background: zeros(n),
+        reason: zeros(n),
         counts: [0; REASONS],
         noise,
         saturation,
@@ -197,12 +198,29 @@ pub fn decode_shot<T: Level>(
         let finest = sets.get(plan.finest).map_or(1.0, |s| s.periods);
         reject_jumps(&mut map, 0.5 * projector_size as f64 / finest);
     }
-    for &r in &map.reason {
-        if let Some(count) = map.counts.get_mut(usize::from(r)) {
-            *count += 1;
+    map.counts = count_reasons(&map.reason);
+    Ok(map)
+}
+
+fn count_reasons(reason: &[u8]) -> [usize; REASONS] {
+    let counts = threads::map_chunks(reason, |_, chunk| count_chunk(chunk));
+    counts.iter().fold([0; REASONS], |sum, c| std::array::from_fn(|r| sum[r] + c[r] as usize))
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+fn count_chunk(reason: &[u8]) -> [u32; REASONS] {
+    let mut counts = [0; REASONS];
+    for (r, count) in counts.iter_mut().enumerate() {
+        // Bytes count bytes, as far as they can.
+        for part in reason.chunks(128) {
+            let mut few = 0u8;
+            for &x in part {
+                few += u8::from(x == r as u8);
+            }
+            *count += u32::from(few);
         }
     }
-    Ok(map)
+    counts
 }
 
 fn validate<T>(shot: &Shot<'_, T>, sets: &[FringeSet], projector_size: usize, options: &DecodeOptions) -> Result<()> {
@@ -513,7 +531,8 @@ fn unwrap(chain: &Chain, work: &mut Work) {
         let why = if work.why[i] > 0.0 { work.why[i] } else { doubt };
         work.column[i] = if why > 0.0 { f64::NAN } else { column };
         work.sigma[i] = if why > 0.0 { f32::NAN } else { sigma as f32 };
-        work.reason[i] = why as u8;
+        // A small whole number in the lowest bits: a conversion would be made one by one.
+        work.reason[i] = (why + 8_388_608.0).to_bits() as u8;
     }
     work.modulation = finest.modulation;
     work.background = finest.background;
@@ -603,9 +622,10 @@ fn reject_jumps(map: &mut PhaseMap, half_fringe_px: f64) {
         let Some(own) = column.get(row * width..(row + 1) * width) else { return Vec::new() };
         let (mut near, mut far) = (vec![0u8; width], vec![0u8; width]);
         count_neighbours(own, &rows, half_fringe_px, &mut near, &mut far);
-        // The pixel itself is among the near ones.
-        let jumps = near.iter().zip(&far).enumerate().filter(|(_, (n, f))| (1..=3).contains(*n) && **f > **n - 1);
-        jumps.map(|(i, _)| row * width + i).collect()
+        if !mark_jumps(&mut near, &far) {
+            return Vec::new();
+        }
+        near.iter().enumerate().filter(|(_, jump)| **jump > 0).map(|(i, _)| row * width + i).collect()
     };
     let found: Vec<Vec<usize>> = threads::install(|| (0..map.height).into_par_iter().map(row_jumps).collect());
     for at in found.into_iter().flatten() {
@@ -615,6 +635,19 @@ fn reject_jumps(map: &mut PhaseMap, half_fringe_px: f64) {
             (*c, *s, *r) = (f64::NAN, f32::NAN, Reason::OrderInDoubt as u8);
         }
     }
+}
+
+/// Turns the counts in `near` into ones where there is a jump; says whether there is any.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+fn mark_jumps(near: &mut [u8], far: &[u8]) -> bool {
+    let mut any = 0;
+    for (near, &far) in near.iter_mut().zip(far) {
+        // The pixel itself is among the near ones.
+        let jump = u8::from(*near >= 1) & u8::from(*near <= 3) & u8::from(far + 1 > *near);
+        *near = jump;
+        any |= jump;
+    }
+    any > 0
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]

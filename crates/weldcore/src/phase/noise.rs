@@ -13,8 +13,11 @@
 //! runs of pixels, the quiet tenth of the runs speaks for its band of grey levels, corrected by the quantile of chi²,
 //! and a line is fitted to the bands.
 
+use rayon::prelude::*;
+
 use super::wave::Level;
 use super::{FringeSet, Shot};
+use crate::threads;
 
 /// Variance of rounding to whole grey levels.
 pub(crate) const ROUNDING: f64 = 1.0 / 12.0;
@@ -138,6 +141,12 @@ impl Bands {
         }
     }
 
+    fn append(&mut self, other: Self) {
+        for (mine, theirs) in self.runs.iter_mut().zip(other.runs) {
+            mine.extend(theirs);
+        }
+    }
+
     /// A run holds neighbours only: it ends where the pixels do.
     fn end_run(&mut self) {
         self.open = (0, 0.0, 0.0);
@@ -197,14 +206,22 @@ fn fit_line(bands: &[(f64, f64, f64)]) -> Option<(f64, f64)> {
 /// The noise model of a shot.
 pub(crate) fn estimate<T: Level>(shot: &Shot<'_, T>, sets: &[FringeSet], saturation: f32) -> Noise {
     let (contrasts, source) = contrasts(sets);
-    let (mut across, mut along) = (Bands::default(), Bands::default());
-    for frames in &shot.exposures {
-        for contrast in &contrasts {
-            for row in sample_rows(shot.height) {
-                let pair = [row, row + 1].map(|r| Row::of(frames, contrast, r, shot.width));
+    let rows: Vec<usize> = sample_rows(shot.height).collect();
+    let look = |row: &usize| {
+        let (mut across, mut along) = (Bands::default(), Bands::default());
+        for frames in &shot.exposures {
+            for contrast in &contrasts {
+                let pair = [*row, *row + 1].map(|r| Row::of(frames, contrast, r, shot.width));
                 pair_differences(&pair, saturation, &mut across, &mut along);
             }
         }
+        [across, along]
+    };
+    let found: Vec<[Bands; 2]> = threads::install(|| rows.par_iter().map(look).collect());
+    let (mut across, mut along) = (Bands::default(), Bands::default());
+    for [a, b] in found {
+        across.append(a);
+        along.append(b);
     }
     let quieter = [across, along]
         .map(Bands::variances)

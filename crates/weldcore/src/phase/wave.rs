@@ -95,7 +95,7 @@ fn demodulate_u16(frames: &[&[u16; TILE]], wave: &Wave, out: &mut Sinusoid) {
 fn demodulate<T: Level>(frames: &[&[T; TILE]], wave: &Wave, out: &mut Sinusoid) {
     match frames.len() {
         3 => demodulate_fixed::<T, 3>(frames, wave, out),
-        4 => demodulate_fixed::<T, 4>(frames, wave, out),
+        4 => demodulate_four(frames, out),
         5 => demodulate_fixed::<T, 5>(frames, wave, out),
         6 => demodulate_fixed::<T, 6>(frames, wave, out),
         8 => demodulate_fixed::<T, 8>(frames, wave, out),
@@ -136,6 +136,22 @@ fn demodulate_fixed<T: Level, const N: usize>(frames: &[&[T; TILE]], wave: &Wave
         out.background[i] = background;
         out.rest[i] = rest;
         out.top[i] = top;
+    }
+}
+
+/// Four steps: cos and sin are 0 and ±1, and the residual is what alternates.
+#[inline(always)]
+fn demodulate_four<T: Level>(frames: &[&[T; TILE]], out: &mut Sinusoid) {
+    let &[a, b, c, d] = frames else { return };
+    for i in 0..TILE {
+        let (a, b, c, d): (f32, f32, f32, f32) = (a[i].into(), b[i].into(), c[i].into(), d[i].into());
+        let higher = |x: f32, y: f32| if x > y { x } else { y };
+        let alternating = (a + c) - (b + d);
+        out.re[i] = 0.5 * (a - c);
+        out.im[i] = 0.5 * (b - d);
+        out.background[i] = 0.25 * ((a + c) + (b + d));
+        out.rest[i] = 0.25 * (alternating * alternating);
+        out.top[i] = higher(higher(a, b), higher(c, d));
     }
 }
 

@@ -5,6 +5,7 @@ use rayon::prelude::*;
 
 use super::wave::{TILE, Wave, atan2};
 use crate::error::{Error, Result};
+use crate::memory::zeros;
 use crate::threads::{self, CHUNK};
 
 /// What [`decode_phase`] found; everything set after set, each row-major.
@@ -76,10 +77,10 @@ pub fn decode_phase<T: Copy + Into<f64> + Sync>(images: &[&[T]], steps: &[usize]
     }
     let size = n * steps.len();
     let mut out = WrappedPhase {
-        phase_rad: vec![0.0; size],
-        modulation: vec![0.0; size],
-        background: vec![0.0; size],
-        residual: vec![0.0; size],
+        phase_rad: zeros(size),
+        modulation: zeros(size),
+        background: zeros(size),
+        residual: zeros(size),
     };
     let mut first = 0;
     for (set, &steps) in steps.iter().enumerate() {

@@ -12,8 +12,9 @@ use std::f64::consts::TAU;
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
-use crate::phase::round64;
-use crate::threads;
+use crate::memory::zeros;
+use crate::phase::{round, round64};
+use crate::threads::{self, CHUNK};
 
 /// Side of a tile, pixels.
 const SIDE: usize = 64;
@@ -104,7 +105,7 @@ impl Image<'_> {
 
     /// The turns to add to `b` to be in line with `a`.
     fn turns(&self, a: usize, b: usize) -> i32 {
-        (self.phase[a] - self.phase[b]).round_ties_even() as i32
+        round(self.phase[a] - self.phase[b]) as i32
     }
 }
 
@@ -233,7 +234,7 @@ pub fn unwrap_spatial(
         threads::install(|| corners.into_par_iter().map(|(left, top)| join_tile(&image, left, top)).collect());
 
     // Second round: the groups of all tiles, and the joints that wait.
-    let mut group = vec![(0u32, 0i32); n];
+    let mut group = zeros::<(u32, i32)>(n);
     let mut waiting = Vec::new();
     for tile in &tiles {
         for (y, row) in tile.group.chunks(tile.width).enumerate().take(tile.height) {
@@ -267,7 +268,13 @@ pub fn unwrap_spatial(
         let kept = whole(wrapped[first as usize]) - whole(wrapped[i]);
         wrapped[i] + TAU * (f64::from(turns + more) + kept)
     };
-    Ok(threads::install(|| (0..n).into_par_iter().with_min_len(1 << 14).map(answer).collect()))
+    let mut out = zeros(n);
+    threads::install(|| {
+        out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, values): (usize, &mut [f64])| {
+            values.iter_mut().enumerate().for_each(|(i, v)| *v = answer(chunk * CHUNK + i));
+        });
+    });
+    Ok(out)
 }
 
 /// The sum of the squared second differences, in turns squared, along row, column and both diagonals.
@@ -290,8 +297,7 @@ const WORST: f32 = 1.0;
 
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
 fn bend(above: &[f32], here: &[f32], below: &[f32], out: &mut [f32]) {
-    const SHIFT: f32 = 12_582_912.0;
-    let wrap = |d: f32| d - ((d + SHIFT) - SHIFT);
+    let wrap = |d: f32| d - round(d);
     let width = out.len().min(here.len()).min(above.len()).min(below.len());
     let (above, here, below, out) = (&above[..width], &here[..width], &below[..width], &mut out[..width]);
     let square = |before: f32, at: f32, after: f32| {

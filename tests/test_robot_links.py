@@ -390,3 +390,17 @@ def test_heartbeat(arm, monkeypatch):
         before = robot._number
         time.sleep(0.5)
         assert robot._number > before
+
+
+def test_rsi_answering_process_dies_and_never_outlives_the_robot(arm):
+    controller, robot = connect("rsi", arm)
+    with controller, robot:
+        robot.pose()
+        robot._process.kill()
+        robot._process.wait()
+        with pytest.raises(DeviceTimeout):
+            for _ in range(100):
+                robot.pose()
+    robot = RsiRobot(RsiSettings(port=0))
+    robot.close()
+    assert robot._process.poll() is not None

@@ -62,7 +62,7 @@ def answer_rsipi(folder, delay_ms, cycles):
             poses = [robot.pose().flange]
             stop = time.monotonic() + 60 + cycles * 0.1
             while robot.answered < cycles and time.monotonic() < stop and server.poll() is None:
-                time.sleep(0.05)
+                robot.pose()  # and so learn how many were answered
             poses.append(robot.pose().flange)
         finally:
             server.send_signal(signal.SIGINT)

@@ -15,7 +15,8 @@ from weldscan import DeviceError, InputError, KukaPose
 from weldscan.devices import kvp
 from weldscan.devices.controller import Arm, Fault
 from weldscan.devices.eki import OURS, EkiConfig, EkiController, EkiUdpController, compose, dissect
-from weldscan.devices.rsi import RsiController, RsiRobot, RsiSettings, answer
+from weldscan.devices.rsi import RsiController, RsiRobot, RsiSettings
+from weldscan.devices.rsi_answer import answer
 from weldscan.devices.serial import checksum, cut_line, decode_line, encode_line
 from weldscan.devices.wire import cut_xml, parse_xml
 

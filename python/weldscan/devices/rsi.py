@@ -1,17 +1,16 @@
-"""RSI: the controller sends its pose as XML over UDP every 4 or 12 ms, and stops the robot when it gets no answer in
-time.
+"""RSI: the controller sends its pose as XML over UDP every 4 or 12 ms, and stops when it gets no answer in time.
 
-Used here to read poses only: every answer carries zero corrections and echoes IPOC, digit by digit. The stream is
-answered by a thread of its own before it is looked at. With ONLYSEND = TRUE in the configuration the controller wants
-no answer, which is the better choice for a measuring cell: `krl/WeldscanRsi.xml`.
+Used here to read poses only: every answer carries zero corrections and echoes IPOC, digit by digit. A process of its
+own (`rsi_answer.py`) answers before anyone looks. With ONLYSEND = TRUE in the configuration the controller wants no
+answer, which is the better choice for a measuring cell: `krl/WeldscanRsi.xml`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
-import re
 import socket
+import subprocess
+import sys
 import threading
 import time
 from typing import Annotated, Literal
@@ -19,18 +18,16 @@ from xml.etree import ElementTree
 
 from pydantic import Field
 
+from weldscan.devices import rsi_answer
 from weldscan.devices.controller import HUGE_BYTES, Arm, Controller, Fault
 from weldscan.devices.robot import Reading, Robot, RobotSettings
+from weldscan.devices.rsi_answer import IPOC, LARGEST_PACKET, REPORT
 from weldscan.devices.wire import parse_xml
 from weldscan.errors import DeviceError, DeviceTimeout, InputError
 from weldscan.pose import KukaPose
 
-LARGEST_PACKET = 65_535
 CARTESIAN = ("X", "Y", "Z", "A", "B", "C")
 JOINTS = ("A1", "A2", "A3", "A4", "A5", "A6")
-REAL_TIME_PRIORITY = 10
-"""Of the answering thread alone, above every ordinary thread; it waits for packets nearly all the time."""
-_IPOC = re.compile(rb"<IPOC>\s*(\d{1,20})\s*</IPOC>")
 
 
 class RsiSettings(RobotSettings):
@@ -51,21 +48,6 @@ class RsiSettings(RobotSettings):
     """$BASE while RSI runs."""
 
 
-def answer(packet: bytes, sen_type: str) -> bytes | None:
-    """Return the answer to a packet: no correction, and its IPOC as it came. None when it has no IPOC.
-
-    >>> answer(b'<Rob Type="KUKA"><IPOC>0042</IPOC></Rob>', "ImFree")[-23:]
-    b'<IPOC>0042</IPOC></Sen>'
-    """
-    ipoc = _IPOC.search(packet)
-    if ipoc is None:
-        return None
-    return b'<Sen Type="%s"><RKorr X="0.0" Y="0.0" Z="0.0" A="0.0" B="0.0" C="0.0"/><IPOC>%s</IPOC></Sen>' % (
-        sen_type.encode(),
-        ipoc[1],
-    )
-
-
 class RsiRobot(Robot):
     """The pose stream of a robot that runs RSI. The link cannot move the robot."""
 
@@ -75,30 +57,33 @@ class RsiRobot(Robot):
     def __init__(self, settings: RsiSettings) -> None:
         self.settings = settings
         self.name = f"RSI {settings.host}:{settings.port}"
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            self._socket.bind((settings.host, settings.port))
-        except OSError as error:
-            self._socket.close()
-            raise DeviceError(f"{self.name}: cannot listen: {error.strerror}") from error
-        self.port: int = self._socket.getsockname()[1]
-        self._news = threading.Condition()
-        self._packet, self._time_s, self._ipoc = b"", float("-inf"), -1
         self.packets = self.answered = self.unusable = self.repeated = 0
-        self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._listen, daemon=True)
-        self._thread.start()
+        self._ipoc = -1
+        self._lock = threading.Lock()
+        self._reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._reports.bind(("127.0.0.1", 0))
+        words = [settings.host, settings.port, settings.controller, settings.sen_type, int(settings.only_send)]
+        self._process = subprocess.Popen(
+            [sys.executable, "-I", "-S", rsi_answer.__file__, *map(str, words), str(self._reports.getsockname()[1])],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        said = self._process.stdout.readline().split(maxsplit=2)  # type: ignore[union-attr]
+        if said[:1] != ["ok"]:
+            self.close()
+            raise DeviceError(f"{self.name}: cannot listen: {' '.join(said)}")
+        self.port = int(said[1])
+        self._reporter = ("127.0.0.1", int(said[2]))
 
     def read(self) -> Reading:
         """Wait for the next packet of the stream: what came before the question is not an answer to it."""
         asked_s = time.monotonic()
-        with self._news:
-            if not self._news.wait_for(lambda: self._time_s > asked_s, self.settings.timeout_s):
-                raise DeviceTimeout(
-                    f"{self.name}: no new pose within {self.settings.timeout_s:g} s "
-                    f"({self.packets} packets so far, {self.unusable} unusable, {self.repeated} repeated)"
-                )
-            packet, time_s = self._packet, self._time_s
+        with self._lock:
+            while True:
+                time_s, packet = self._report(asked_s + self.settings.timeout_s)
+                if time_s > asked_s:
+                    break
         try:
             return self._reading(packet, time_s)
         except (DeviceError, InputError) as error:
@@ -106,42 +91,38 @@ class RsiRobot(Robot):
 
     def close(self) -> None:
         """Stop listening. The controller then stops the robot's RSI program, unless it only sends."""
-        self._closed.set()
-        self._thread.join(2.0)
-        self._socket.close()
+        self._process.stdin.close()  # type: ignore[union-attr]
+        try:
+            self._process.wait(2.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()  # type: ignore[union-attr]
+        self._reports.close()
 
-    def _listen(self) -> None:
-        """Answer first, look later."""
-        with contextlib.suppress(AttributeError, OSError):  # real-time priority where the system has it and allows it
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REAL_TIME_PRIORITY))
-        self._socket.settimeout(0.2)
-        while not self._closed.is_set():
+    def _report(self, deadline_s: float) -> tuple[float, bytes]:
+        """Return the next usable packet that tells something new, and when it came."""
+        while True:
+            self._reports.settimeout(max(deadline_s - time.monotonic(), 1e-4))
             try:
-                packet, peer = self._socket.recvfrom(LARGEST_PACKET)
+                report, peer = self._reports.recvfrom(LARGEST_PACKET)
             except TimeoutError:
+                raise DeviceTimeout(
+                    f"{self.name}: no new pose within {self.settings.timeout_s:g} s "
+                    f"({self.packets} packets so far, {self.unusable} unusable, {self.repeated} repeated)"
+                ) from None
+            if peer != self._reporter or len(report) < REPORT.size:
                 continue
-            except OSError:
-                continue  # an ICMP message about an earlier answer: the controller went away, and may come back
-            now_s = time.monotonic()
-            if peer[0] != self.settings.controller:
+            time_s, self.packets, self.answered, self.unusable = REPORT.unpack_from(report)
+            packet = report[REPORT.size :]
+            ipoc = IPOC.search(packet)
+            if ipoc is None:
                 continue
-            reply = answer(packet, self.settings.sen_type)
-            if reply is not None and not self.settings.only_send:
-                with contextlib.suppress(OSError):
-                    self._socket.sendto(reply, peer)
-                    self.answered += 1
-            self.packets += 1
-            ipoc = _IPOC.search(packet)
-            if ipoc is None or len(packet) > 8192:
-                self.unusable += 1
-                continue
-            number = int(ipoc[1])
-            if number == self._ipoc:
+            if int(ipoc[1]) == self._ipoc:
                 self.repeated += 1  # a stream that stands still tells nothing new
                 continue
-            with self._news:
-                self._ipoc, self._packet, self._time_s = number, packet, now_s
-                self._news.notify_all()
+            self._ipoc = int(ipoc[1])
+            return time_s, packet
 
     def _reading(self, packet: bytes, time_s: float) -> Reading:
         root = parse_xml(packet, "Rob")
@@ -255,7 +236,7 @@ class RsiController(Controller):
                 return
             except OSError:
                 continue
-            ipoc = _IPOC.search(reply)
+            ipoc = IPOC.search(reply)
             if ipoc is not None and int(ipoc[1]) == self.ipoc and reply.startswith(want):
                 return
             if ipoc is None or int(ipoc[1]) > self.ipoc or not reply.startswith(want):

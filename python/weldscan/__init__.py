@@ -25,6 +25,7 @@ from weldscan._weldcore import (
     Sphere,
     SphereFit,
     WeakDirection,
+    WeldShot,
     WrappedPhase,
     __version__,
     calibrate_reference_plane,
@@ -39,8 +40,11 @@ from weldscan._weldcore import (
     fit_plane,
     fit_sphere,
     height_from_reference,
+    measure_step,
+    place_shots,
     register_icp,
     register_rigid,
+    segment_weld,
     set_threads,
     simulate_shot,
     simulated_step,
@@ -63,7 +67,10 @@ from weldscan.pose import (
 )
 
 if TYPE_CHECKING:
+    from weldscan.calibration.hand_eye import solve_hand_eye
+    from weldscan.inspection import inspect
     from weldscan.norms import judge, limit_mm, norm_ids
+    from weldscan.paper_method import paper_step
     from weldscan.report import write_report
     from weldscan.report.validation import write_validation
     from weldscan.result import Inspection, Label, Validation, Verdict
@@ -71,6 +78,9 @@ if TYPE_CHECKING:
 
 # The faces are imported when they are asked for: they bring pydantic and OpenCV, which an algorithm does not need.
 _LAZY = {
+    "weldscan.calibration.hand_eye": ("solve_hand_eye",),
+    "weldscan.inspection": ("inspect",),
+    "weldscan.paper_method": ("paper_step",),
     "weldscan.norms": ("judge", "limit_mm", "norm_ids"),
     "weldscan.report": ("write_report",),
     "weldscan.report.validation": ("write_validation",),
@@ -118,6 +128,7 @@ __all__ = [
     "Validation",
     "Verdict",
     "WeakDirection",
+    "WeldShot",
     "WeldscanError",
     "WrappedPhase",
     "__version__",
@@ -136,22 +147,28 @@ __all__ = [
     "format_e6pos",
     "format_frame",
     "height_from_reference",
+    "inspect",
     "iter_frames",
     "judge",
     "kuka_from_matrix",
     "limit_mm",
     "matrix_from_kuka",
+    "measure_step",
     "norm_ids",
+    "paper_step",
     "parse_e6axis",
     "parse_e6pos",
     "parse_frame",
+    "place_shots",
     "read_frames",
     "read_session",
     "register_icp",
     "register_rigid",
+    "segment_weld",
     "set_threads",
     "simulate_shot",
     "simulated_step",
+    "solve_hand_eye",
     "sphere_through_points",
     "triangulate",
     "unwrap_spatial",

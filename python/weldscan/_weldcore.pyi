@@ -25,6 +25,7 @@ __all__ = [
     "Sphere",
     "SphereFit",
     "WeakDirection",
+    "WeldShot",
     "WrappedPhase",
     "__version__",
     "calibrate_reference_plane",
@@ -39,8 +40,11 @@ __all__ = [
     "fit_plane",
     "fit_sphere",
     "height_from_reference",
+    "measure_step",
+    "place_shots",
     "register_icp",
     "register_rigid",
+    "segment_weld",
     "set_threads",
     "simulate_shot",
     "simulated_step",
@@ -430,3 +434,50 @@ def register_icp(
     weak: float = 0.01,
     max_points: int | None = None,
 ) -> Registration: ...
+
+# segment, step, place
+@final
+class WeldShot:
+    @property
+    def origin_mm(self) -> NDArray[np.float64]: ...
+    @property
+    def axis(self) -> NDArray[np.float64]: ...
+    @property
+    def zero(self) -> NDArray[np.float64]: ...
+    @property
+    def radius_mm(self) -> float: ...
+    @property
+    def radius_fitted(self) -> bool: ...
+    @property
+    def noise_mm(self) -> float: ...
+    @property
+    def bead_width_mm(self) -> float: ...
+    @property
+    def labels(self) -> NDArray[np.uint8]: ...
+    @property
+    def angle_rad(self) -> NDArray[np.float32]: ...
+    @property
+    def axial_mm(self) -> NDArray[np.float32]: ...
+    @property
+    def deviation_mm(self) -> NDArray[np.float32]: ...
+
+def segment_weld(
+    points_mm: NDArray[np.float64],
+    radius_mm: float,
+    wall_thickness_mm: float,
+    axis: Sequence[float] | None = None,
+    zero: Sequence[float] | None = None,
+) -> WeldShot: ...
+def measure_step(
+    shots: Sequence[WeldShot], angle_sigma_rad: float = 0.0, scanner_sigma_mm: float = 0.0
+) -> dict[str, Any]: ...
+def place_shots(
+    shots: Sequence[tuple[WeldShot, NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], int]],
+) -> tuple[
+    NDArray[np.float64],
+    NDArray[np.uint8],
+    NDArray[np.float32],
+    NDArray[np.float32],
+    NDArray[np.float32],
+    NDArray[np.uint16],
+]: ...

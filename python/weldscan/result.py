@@ -120,7 +120,7 @@ class HandEye:
 
     flange_from_scanner: Floats
     covariance: Floats
-    """6x6, of a small rotation (rad, scanner axes) and translation (mm) applied on the scanner's side."""
+    """6x6, of a small rotation about the scanner's axes (rad) and a translation along the flange's axes (mm)."""
     residual_rms_mm: float
     per_shot: tuple[ArtefactShot, ...]
     touched_distances_mm: Floats
@@ -145,7 +145,7 @@ class PartCloud:
     """About the axis, right-handed, from the zero mark, in [0, 360)."""
     axial_mm: NDArray[np.float32]
     """Along the axis from the seam's centreline; the reference wall is negative."""
-    shot: NDArray[np.uint8]
+    shot: NDArray[np.uint16]
     """Index of the part shot."""
 
 

@@ -258,7 +258,7 @@ class HandEyeSpec(_Model):
     date: Annotated[str, Field(max_length=100)]
     flange_from_scanner: Rigid
     covariance: Annotated[Matrix, AfterValidator(_covariance)]
-    """6x6, of a small rotation (rad, scanner axes) and translation (mm) applied on the scanner's side."""
+    """6x6, of a small rotation about the scanner's axes (rad) and a translation along the flange's axes (mm)."""
     residual_rms_mm: Annotated[float, Field(ge=0)]
     reduced_chi2: Annotated[float, Field(ge=0)] | None = None
     working_point_u_mm: Annotated[float, Field(ge=0)] | None = None

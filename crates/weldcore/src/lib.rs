@@ -26,6 +26,7 @@
 //! | [`distance`] | signed distance to clouds, meshes and analytic surfaces |
 //! | [`mesh`] | triangle meshes |
 //! | [`segment`] | reference wall, other wall and bead |
+//! | [`place`] | the shots of a part joined into one cloud in base |
 //! | [`step`] | the step around the seam and its uncertainty |
 //! | [`image`] | grey PNG files, read strictly |
 //! | [`simulate`] | ray-cast fringe images of analytic scenes |
@@ -40,6 +41,7 @@ mod memory;
 pub mod mesh;
 pub mod normals;
 pub mod phase;
+pub mod place;
 pub mod scanner;
 pub mod segment;
 pub mod simulate;

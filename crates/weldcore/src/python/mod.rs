@@ -15,6 +15,7 @@ mod kdtree;
 mod normals;
 mod phase;
 mod scanner;
+mod segment;
 mod simulate;
 mod transform;
 mod triangulate;
@@ -121,6 +122,7 @@ fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
     scanner::register(m)?;
     phase::register(m)?;
     triangulate::register(m)?;
+    segment::register(m)?;
     kdtree::register(m)?;
     transform::register(m)?;
     distance::register(m)?;

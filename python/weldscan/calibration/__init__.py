@@ -1,0 +1,1 @@
+"""What ties the numbers to the world: the three-sphere artefact and the hand-eye transform."""

@@ -1,0 +1,106 @@
+"""The three-sphere plate in one shot: which sphere is which, and whether it is the plate that the session describes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldscan._weldcore import find_spheres
+from weldscan.errors import GeometryError, InputError
+
+Floats = NDArray[np.float64]
+
+PAIRS = ((0, 1), (1, 2), (2, 0))
+# How much longer or shorter a distance may come out than it was touched: half a percent of it is far more than any
+# calibrated scanner's scale error, and far less than two spheres of a plate must differ to be told apart.
+SCALE_TOLERANCE = 0.005
+# Standard uncertainty of one coordinate of a touched centre, mm: contact probing with the robot.
+TOUCH_SIGMA_MM = 0.02
+
+
+class PlateMismatch(InputError):
+    """The spheres in view are not those that the session describes."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlateView:
+    """The three spheres of one artefact shot in the order of the touched centres, scanner frame."""
+
+    shot: str
+    centres_mm: Floats
+    """(3, 3): sphere by coordinate."""
+    covariances_mm2: Floats
+    """(3, 3, 3): sphere by coordinate by coordinate."""
+    rms_mm: tuple[float, ...]
+    points: tuple[int, ...]
+
+
+def distances(centres_mm: Floats) -> Floats:
+    """Between the spheres 1-2, 2-3, 3-1, mm."""
+    return np.array([np.linalg.norm(centres_mm[i] - centres_mm[j]) for i, j in PAIRS])
+
+
+def find_plate(shot: str, points_mm: Floats, sphere_diameter_mm: float, touched_mm: Floats) -> PlateView:
+    """Finds the plate's spheres in one shot and names them by their distances.
+
+    Args:
+        shot: its name, for messages.
+        points_mm: (H, W, 3) float64, scanner frame, NaN where there is no point.
+        sphere_diameter_mm: the calibrated diameter.
+        touched_mm: (3, 3), the touched centres in base.
+
+    Raises:
+        GeometryError: fewer than three spheres of that size are in view.
+        PlateMismatch: three are, but their distances are not the touched ones; the message says by how much.
+    """
+    found = find_spheres(points_mm, sphere_diameter_mm / 2)
+    if len(found) < 3:
+        raise GeometryError(f"{len(found)} of 3 spheres of {sphere_diameter_mm:g} mm found")
+    centres = np.array([sphere.center_mm for sphere in found])
+    covariances = np.array([sphere.covariance for sphere in found])
+    wanted = distances(touched_mm)
+
+    def misfit(order: tuple[int, ...]) -> Floats:
+        return distances(centres[list(order)]) - wanted
+
+    order = min(permutations(range(len(found)), 3), key=lambda candidate: float(np.square(misfit(candidate)).sum()))
+    off = misfit(order)
+    chosen = list(order)
+    sigma = np.sqrt([np.trace(covariances[order[i]] + covariances[order[j]]) / 3 for i, j in PAIRS])
+    tolerance = SCALE_TOLERANCE * wanted + 5 * np.hypot(sigma, np.sqrt(2) * TOUCH_SIGMA_MM)
+    if np.any(np.abs(off) > tolerance):
+        raise PlateMismatch(
+            "artefact.centres_base: this is not the plate in view: the distances touched are "
+            + ", ".join(f"{d:.3f}" for d in wanted)
+            + " mm, those scanned "
+            + ", ".join(f"{d:+.3f}" for d in off)
+            + " mm off"
+        )
+    return PlateView(
+        shot=shot,
+        centres_mm=centres[chosen],
+        covariances_mm2=covariances[chosen],
+        rms_mm=tuple(float(found[i].rms_mm) for i in chosen),
+        points=tuple(len(found[i].inliers) for i in chosen),
+    )
+
+
+def check_side(view: PlateView, touched_mm: Floats, base_from_flange: Floats) -> None:
+    """The scanner and the flange that carries it look at the same side of the plate; a mirrored plate breaks that.
+
+    Raises:
+        PlateMismatch: `centres_base` lists a mirrored plate.
+    """
+
+    def side(centres: Floats, eye: Floats) -> float:
+        normal = np.cross(centres[1] - centres[0], centres[2] - centres[0])
+        return float(np.dot(normal, eye - centres.mean(axis=0)))
+
+    if side(view.centres_mm, np.zeros(3)) * side(touched_mm, base_from_flange[:3, 3]) < 0:
+        raise PlateMismatch(
+            "artefact.centres_base: the plate is mirrored: its spheres run the other way round than those in view, "
+            "though all distances fit"
+        )

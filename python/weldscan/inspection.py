@@ -1,0 +1,250 @@
+"""The whole method, top to bottom: fringe images in, step and verdict out.
+
+Every line of `inspect` is one arrow of the flow; what stands below it only fits the pieces together.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldscan._weldcore import WeldShot, __version__, measure_step, place_shots, segment_weld
+from weldscan.calibration.hand_eye import (
+    POSE_SIGMA_MM,
+    POSE_SIGMA_RAD,
+    base_from_flange,
+    hand_eye_of,
+    point_uncertainty_mm,
+)
+from weldscan.errors import GeometryError, InputError
+from weldscan.norms import judge, load_norm
+from weldscan.paper_method import paper_step
+from weldscan.points import PointReader, Progress
+from weldscan.result import BudgetLine, HandEye, Histogram, Inspection, PartCloud, StepResult
+from weldscan.session import PartSpec, ShotSpec, read_session
+
+Floats = NDArray[np.float64]
+DEFAULT_NORMS = ("pnae-g-7-010-89",)
+METHODS = ("surface", "paper")
+
+
+def inspect(
+    folder: str | os.PathLike[str],
+    *,
+    method: str = "surface",
+    norms: Sequence[str] = DEFAULT_NORMS,
+    progress: Progress | None = None,
+) -> Inspection:
+    """The step of a weld with its uncertainty and verdicts, from a session folder.
+
+    Args:
+        folder: a `weldscan-session/1` folder (docs/formats.md).
+        method: which number is judged: `surface` (the largest step around the seam) or `paper` (the paper's histogram).
+        norms: ids as `weldscan.norms.norm_ids()` lists them.
+        progress: called with (done, total, what) while it works.
+
+    Returns:
+        Inspection. What could not be measured has `step` None and verdicts NOT MEASURED with the reason.
+
+    Raises:
+        InputError: a file, a field or an argument is wrong, or the plate is not the one described.
+
+    Example:
+        >>> import tempfile
+        >>> from weldscan import inspect
+        >>> from weldscan.devices.simulated import simulate_session
+        >>> folder = tempfile.mkdtemp() + "/session"
+        >>> truth = simulate_session(folder)
+        >>> result = inspect(folder)
+        >>> abs(result.step.max_abs_mm - abs(truth["step_mm"]["max_abs"])) < result.step.expanded_uncertainty_mm
+        True
+    """
+    run = _Run(folder, method, norms, progress)
+    # 1-4  the three-sphere plate in every artefact shot: where the scanner sits on the flange
+    hand_eye = hand_eye_of(run.read, run.left_out)
+    # 5-6  every part shot: its points, its place in base, reference wall, other wall and bead
+    welds = [weld for shot in run.session.part_shots if (weld := run.weld(shot, hand_eye)) is not None]
+    # 7    the step: all shots in one model, each against its own reference wall; and the paper's chain
+    step, cloud = run.measure(welds, hand_eye)
+    # 8    the verdict
+    return run.judged(step, cloud, hand_eye)
+
+
+@dataclass(frozen=True, eq=False)
+class _Weld:
+    """One segmented part shot."""
+
+    index: int
+    points_mm: Floats
+    """(H, W, 3), scanner frame, NaN where there is none."""
+    base_from_scanner: Floats
+    shot: WeldShot
+
+
+class _Run:
+    """One inspection under way: the session, and what went wrong."""
+
+    def __init__(
+        self, folder: str | os.PathLike[str], method: str, norms: Sequence[str], progress: Progress | None
+    ) -> None:
+        if method not in METHODS:
+            raise InputError(f"method: must be one of {', '.join(METHODS)}, got {method!r}")
+        for norm in norms:
+            load_norm(norm)
+        self.session = read_session(folder)
+        if self.session.part is None or not self.session.part_shots:
+            raise InputError(f"{self.session.folder / 'session.json'}: shots: none is of the part")
+        self.part: PartSpec = self.session.part
+        self.method, self.norms = method, tuple(norms)
+        self.read = PointReader(self.session, progress)
+        self.left_out: list[tuple[str, str]] = []
+
+    def weld(self, shot: ShotSpec, hand_eye: HandEye | None) -> _Weld | None:
+        """Steps 5 and 6: one part shot, placed and segmented; None with the reason kept."""
+        base_from_scanner = np.eye(4)
+        if self.session.has_robot:
+            if hand_eye is None:
+                self.left_out.append((shot.name, "no artefact shot could be used, so its place in base is unknown"))
+                return None
+            base_from_scanner = base_from_flange(shot) @ hand_eye.flange_from_scanner
+        cloud = self.read(shot)
+        t = time.perf_counter()
+        part, turn = self.part, base_from_scanner[:3, :3].T
+        axis, zero = (None if v is None else (turn @ np.array(v)).tolist() for v in (part.axis_base, part.zero_base))
+        try:
+            segmented = segment_weld(cloud.points_mm, part.outside_diameter / 2, part.wall_thickness, axis, zero)
+        except GeometryError as error:
+            self.left_out.append((shot.name, self.read.why_dark(shot) or str(error)))
+            return None
+        finally:
+            self.read.clock("segment", t)
+        return _Weld(self.session.part_shots.index(shot), cloud.points_mm, base_from_scanner, segmented)
+
+    def measure(self, welds: Sequence[_Weld], hand_eye: HandEye | None) -> tuple[StepResult | None, PartCloud | None]:
+        """Step 7, both methods."""
+        if not welds:
+            return None, None
+        t = time.perf_counter()
+        angle_sigma = 0.0
+        if hand_eye is not None:
+            turn = float(np.linalg.eigvalsh(hand_eye.covariance[:3, :3]).max())
+            angle_sigma = float(np.sqrt(max(turn, 0.0) + POSE_SIGMA_RAD**2))
+        try:
+            step = measure_step([weld.shot for weld in welds], angle_sigma_rad=angle_sigma)
+        except GeometryError as error:
+            self.left_out.extend((self.session.part_shots[weld.index].name, str(error)) for weld in welds)
+            return None, None
+        t = self.read.clock("measure", t)
+        deviations = step["deviation_mm"]
+        cloud = PartCloud(
+            *place_shots(
+                [(w.shot, w.points_mm, w.base_from_scanner, d, w.index) for w, d in zip(welds, deviations, strict=True)]
+            )
+        )
+        t = self.read.clock("place", t)
+        histogram = self.paper(cloud, welds[0])
+        self.read.clock("paper", t)
+        return _step_result(step, histogram), cloud
+
+    def paper(self, cloud: PartCloud, weld: _Weld) -> Histogram | None:
+        """The paper's chain; None with a warning where it finds no answer."""
+        turn, shift = weld.base_from_scanner[:3, :3], weld.base_from_scanner[:3, 3]
+        origin, axis = turn @ weld.shot.origin_mm + shift, turn @ weld.shot.axis
+        try:
+            return paper_step(cloud.points_mm, origin, axis, self.part.outside_diameter / 2)
+        except GeometryError as error:
+            self.read.warnings.append(f"method paper gave no answer: {error}")
+            return None
+
+    def judged(self, step: StepResult | None, cloud: PartCloud | None, hand_eye: HandEye | None) -> Inspection:
+        """Step 8, and everything together."""
+        value, expanded, coverage = None, None, None
+        if step is not None:
+            value, expanded, coverage = step.max_abs_mm, step.expanded_uncertainty_mm, step.coverage_deg
+            if self.method == "paper":
+                value = None if step.histogram is None else step.histogram.step_mm
+                expanded = self.paper_uncertainty_mm(expanded, cloud, hand_eye)
+        part = self.part.model_dump()
+        reason = "; ".join(f"{name}: {why}" for name, why in self.left_out) or "method paper gave no answer"
+        verdicts = [
+            verdict
+            for norm in self.norms
+            for verdict in judge(norm, value, expanded, part, why_not_measured=reason, coverage_deg=coverage)
+        ]
+        timing = self.read.timing
+        timing["compute"] = sum(seconds for what, seconds in timing.items() if what != "read")
+        return Inspection(
+            session=self.session.name,
+            part=part,
+            method=self.method,
+            frame="base" if self.session.has_robot else "scanner",
+            step=step,
+            hand_eye=hand_eye,
+            cloud=cloud,
+            verdicts=tuple(verdicts),
+            left_out=tuple(self.left_out),
+            warnings=tuple(self.read.warnings),
+            masks=self.read.masks,
+            timing_s=timing,
+            software={"name": "weldscan", "version": __version__, "python": platform.python_version()},
+        )
+
+    def paper_uncertainty_mm(self, expanded_mm: float, cloud: PartCloud | None, hand_eye: HandEye | None) -> float:
+        """Expanded, k = 2: the surface's, and that the paper's chain joins shots through the robot, errors and all."""
+        if hand_eye is None or cloud is None or len(self.session.part_shots) < 2:
+            return expanded_mm
+        centre = cloud.points_mm.mean(axis=0)
+        poses = [base_from_flange(shot)[:3, 3] for shot in self.session.part_shots]
+        distance = float(np.mean([np.linalg.norm(centre - pose) for pose in poses]))
+        placing = np.hypot(point_uncertainty_mm(hand_eye, np.array([0.0, 0.0, distance])), POSE_SIGMA_MM)
+        return float(np.hypot(expanded_mm, 2 * placing))
+
+
+BUDGET = (
+    ("fit_mm", "noise, extrapolation", "residuals of the walls with their correlation, propagated to the seam"),
+    ("toe_mm", "strip beside the weld", "change of the step when the half bead's width nearest to it is left out"),
+    ("local_mm", "local departure", "scatter of a bin that departs from the smooth walls"),
+    ("angle_mm", "angle", "hand-eye and robot rotation times the slope of the profile"),
+    (
+        "unevenness_mm",
+        "unevenness at the seam",
+        "the walls' correlated unevenness, which the seam need not share",
+    ),
+)
+
+
+def _step_result(step: dict[str, Any], histogram: Histogram | None) -> StepResult:
+    profile = step["profile"]
+    columns = step["profile_columns"]
+    worst = profile[int(np.argmax(np.abs(profile[:, columns.index("step_mm")])))]
+    offset = step["axis_offset_mm"]
+    difference, difference_sigma = step["radius_difference_mm"]
+    return StepResult(
+        mean_mm=step["mean_mm"],
+        median_mm=step["median_mm"],
+        max_abs_mm=step["max_abs_mm"],
+        max_abs_at_deg=step["max_abs_at_deg"],
+        expanded_uncertainty_mm=step["expanded_mm"],
+        histogram=histogram,
+        angle_deg=profile[:, columns.index("angle_deg")],
+        step_mm=profile[:, columns.index("step_mm")],
+        u_mm=2 * profile[:, columns.index("standard_mm")],
+        budget=tuple(
+            BudgetLine(name, float(worst[columns.index(column)]), derived) for column, name, derived in BUDGET
+        ),
+        harmonics_mm={
+            "diameter_difference": 2 * difference,
+            "diameter_difference_u": 4 * difference_sigma,
+            "axis_offset": float(np.hypot(*offset)),
+            "axis_offset_at_deg": float(np.degrees(np.arctan2(offset[1], offset[0])) % 360),
+        },
+        angle_between_walls_deg=float(np.degrees(step["tilt_rad"])),
+        coverage_deg=step["coverage_deg"],
+    )

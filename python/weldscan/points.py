@@ -1,0 +1,97 @@
+"""One recorded shot to points: read, decode, triangulate."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from weldscan._weldcore import Cloud, PhaseMap, Scanner, decode, triangulate
+from weldscan.session import FringeSet, Session, ShotSpec, read_frames
+
+Progress = Callable[[int, int, str], None]
+
+# A harmonic of a tenth of the fringes' own amplitude shifts a four-step phase by 0.01 rad or more: worth a word.
+HARMONIC_WARNING = 0.1
+MASKS = ("ok", "dark", "saturated", "order_in_doubt", "no_fit")
+
+
+class PointReader:
+    """Gives the points of a session's shots, one after the other, and keeps what is worth knowing of each.
+
+    Attributes:
+        timing: seconds spent per step.
+        masks: per shot, how many pixels were measured, and how many not for which reason.
+        warnings: what a reader of the result should know.
+    """
+
+    def __init__(self, session: Session, progress: Progress | None = None) -> None:
+        self.session, self.progress = session, progress
+        self.scanner: Scanner = session.scanner.build()
+        self.axis, self.fringes, self.frames = fringe_axis(session.fringes, self.scanner)
+        self.timing: dict[str, float] = {}
+        self.masks: dict[str, dict[str, int]] = {}
+        self.warnings: list[str] = []
+
+    def __call__(self, shot: ShotSpec) -> Cloud:
+        """The shot's points, scanner frame, on the camera's pixel grid."""
+        if self.progress is not None:
+            self.progress(len(self.masks), len(self.session.shots), shot.name)
+        t = time.perf_counter()
+        exposures = [[stack[i] for i in self.frames] for stack in read_frames(self.session, shot)]
+        t = self.clock("read", t)
+        projector = self.scanner.projector
+        size = projector.width if self.axis == "x" else projector.height
+        phase = decode(exposures, [(f.periods, f.steps) for f in self.fringes], size)
+        t = self.clock("decode", t)
+        cloud = triangulate(phase.column_px, self.scanner, phase.sigma_px, self.axis)
+        self.clock("triangulate", t)
+        self._note(shot, phase)
+        return cloud
+
+    def clock(self, what: str, since: float) -> float:
+        """Adds the time since then to a step; returns now."""
+        now = time.perf_counter()
+        self.timing[what] = self.timing.get(what, 0.0) + now - since
+        return now
+
+    def _note(self, shot: ShotSpec, phase: PhaseMap) -> None:
+        self.masks[shot.name] = dict(zip(MASKS, map(int, phase.counts), strict=True))
+        worst = max((h for h in phase.harmonics if h is not None), default=0.0)
+        if worst > HARMONIC_WARNING and phase.counts[0] > 0:
+            self.warnings.append(
+                f"{shot.name}: the fringes are not sinusoidal (harmonics {100 * worst:.0f} % of their amplitude): "
+                "the projector's response should be corrected"
+            )
+
+    def why_dark(self, shot: ShotSpec) -> str | None:
+        """Why hardly a pixel of a shot was measured, where that is so: a better reason than geometry has."""
+        counts = self.masks[shot.name]
+        total = sum(counts.values())
+        if counts["ok"] * 20 >= total:
+            return None
+        reasons = sorted(((n, name) for name, n in counts.items() if name != "ok" and n), reverse=True)
+        shares = ", ".join(f"{100 * n / total:.0f} % {name.replace('_', ' ')}" for n, name in reasons)
+        return f"hardly any fringes in view: {counts['ok']} of {total} pixels were measured ({shares})"
+
+
+def fringe_axis(fringes: Sequence[FringeSet], scanner: Scanner) -> tuple[str, list[FringeSet], list[int]]:
+    """The axis to triangulate by, its fringe sets, and which of a stack's images are theirs.
+
+    Where both axes were projected, it is the one whose fringes cross the baseline more squarely.
+    """
+    axes = {f.axis for f in fringes}
+    axis: str = next(iter(axes))
+    if len(axes) == 2:
+        camera_seen = np.linalg.inv(scanner.camera_from_projector)[:3, 3]
+        axis = "x" if abs(camera_seen[0]) >= abs(camera_seen[1]) else "y"
+    sets: list[FringeSet] = []
+    frames: list[int] = []
+    at = 0
+    for f in fringes:
+        if f.axis == axis:
+            sets.append(f)
+            frames.extend(range(at, at + f.steps))
+        at += f.steps
+    return axis, sets, frames

@@ -930,7 +930,7 @@ mod tests {
                 .map(|_| {
                     let k =
                         std::array::from_fn::<f64, 2, _>(|_| crate::segment::tests::normal_random(&mut state) / 8.0);
-                    [k[0], k[1], 6.28 * crate::segment::tests::normal_random(&mut state)]
+                    [k[0], k[1], std::f64::consts::TAU * crate::segment::tests::normal_random(&mut state)]
                 })
                 .collect();
             for i in 0..s.labels.len() {

@@ -13,7 +13,10 @@ from weldscan import DeviceError, InputError
 from weldscan.station.cell import read_cell
 from weldscan.station.cli import register
 
-MAIN = "import typer; from weldscan.station.cli import register; app = typer.Typer(); register(app); app()"
+MAIN = (  # a test that runs in the background has Ctrl-C switched off, and its children with it
+    "import signal, typer; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "from weldscan.station.cli import register; app = typer.Typer(); register(app); app()"
+)
 POSE = "610.825 -148.476 481.652 -29.008 23.236 74.641"
 
 

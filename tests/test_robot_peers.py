@@ -16,6 +16,10 @@ from weldscan.devices.controller import Arm
 from weldscan.devices.kvp import KvpController
 from weldscan.devices.rsi import RsiRobot, RsiSettings
 
+SERVER = (  # a test that runs in the background has Ctrl-C switched off, and its children with it
+    "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "runpy.run_module('RSIPI.rsi_echo_server', run_name='__main__')"
+)
 BUSY_SHARE = 0.1
 POSE = KukaPose(610.825, -148.476, 481.652, -29.008, 23.236, 74.641)
 
@@ -52,7 +56,7 @@ def answer_rsipi(folder, delay_ms, cycles):
     options = ["--config", str(config), "--mode", "absolute", "--delay", str(delay_ms), "--timeout-packets", "40"]
     with RsiRobot(RsiSettings(timeout_s=10.0)) as robot:
         server = subprocess.Popen(
-            [sys.executable, "-u", "-m", "RSIPI.rsi_echo_server", *options],
+            [sys.executable, "-u", "-c", SERVER, *options],
             cwd=folder,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -66,7 +70,12 @@ def answer_rsipi(folder, delay_ms, cycles):
             poses.append(robot.pose().flange)
         finally:
             server.send_signal(signal.SIGINT)
-            printed, _ = server.communicate(timeout=20)
+            try:
+                printed, _ = server.communicate(timeout=20)
+            except subprocess.TimeoutExpired:
+                server.kill()
+                server.communicate()
+                raise
         return printed, robot, poses
 
 

@@ -32,7 +32,9 @@ from weldscan.station.scan import scan
 WIDTH, HEIGHT = 48, 32
 FRINGES = [("x", 1, 4), ("x", 4, 4)]
 IMAGES = 9
-MAIN = "from weldscan.cli import main; main()"
+MAIN = (  # a test that runs in the background has Ctrl-C switched off, and its children with it
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from weldscan.cli import main; main()"
+)
 POSES = {
     "artefact-1": (600.0, -150.0, 480.0, -29.0, 23.0, 74.0),
     "artefact-2": (610.0, -140.0, 470.0, -20.0, 25.0, 70.0),

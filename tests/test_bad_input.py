@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-pytest.importorskip("weldscan.inspection")
 from test_simulate import small_scanner
 from weldscan.cli import main
 from weldscan.devices.simulated import DEFAULT, simulate_session

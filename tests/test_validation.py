@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from weldscan import InputError, NotMeasured
-
-validation = pytest.importorskip("weldscan.validation")
-from weldscan.report.validation import write_validation  # noqa: E402
-from weldscan.result import BudgetLine, Label, PartCloud  # noqa: E402
+from conftest import shared
+from weldscan import InputError, NotMeasured, validation
+from weldscan.report.validation import write_validation
+from weldscan.result import BudgetLine, Label, PartCloud
 
 RADIUS, NOISE_MM, PROBE_MM = 136.6, 0.03, 0.015
 # Quadric through some 280 points with this noise: 0.03 * 3 / sqrt(280) is 0.005 mm; the sagitta of the patch that a
@@ -101,3 +100,17 @@ def test_the_files_are_written_as_a_whole(cloud, tmp_path):
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["validation.html", "validation.json"]
     page = (tmp_path / "out" / "validation.html").read_text()
     assert "a &lt;b&gt;" in page and "2 of 3" in page
+
+
+# What the project promises against the probe (the paper found 0.115 mm).
+PROMISED_RMS_MM = 0.06
+
+
+@pytest.mark.parametrize("name", ["open-630", "open-273"])
+def test_scans_of_an_independent_renderer_agree_with_its_probe(name):
+    folder = shared(f"sessions/{name}")
+    found = validation.validate(folder, folder / "touch.csv")
+    good = np.isfinite(found.distance_mm)
+    assert found.compared >= 0.9 * len(found.points_mm) and found.rms_mm <= PROMISED_RMS_MM
+    assert (np.abs(found.distance_mm[good]) <= found.u_mm[good]).mean() >= 0.9
+    assert abs(found.mean_mm) <= found.mean_u_mm

@@ -75,6 +75,7 @@ if TYPE_CHECKING:
     from weldscan.report.validation import write_validation
     from weldscan.result import Inspection, Label, Validation, Verdict
     from weldscan.session import Session, iter_frames, read_frames, read_session, write_session
+    from weldscan.validation import validate
 
 # The faces are imported when they are asked for: they bring pydantic and OpenCV, which an algorithm does not need.
 _LAZY = {
@@ -85,6 +86,7 @@ _LAZY = {
     "weldscan.report": ("write_report",),
     "weldscan.report.validation": ("write_validation",),
     "weldscan.result": ("Inspection", "Label", "Validation", "Verdict"),
+    "weldscan.validation": ("validate",),
     "weldscan.session": ("Session", "iter_frames", "read_frames", "read_session", "write_session"),
 }
 
@@ -173,6 +175,7 @@ __all__ = [
     "triangulate",
     "unwrap_spatial",
     "unwrap_temporal",
+    "validate",
     "write_report",
     "write_session",
     "write_validation",

@@ -193,7 +193,13 @@ class _Run:
             warnings=tuple(self.read.warnings),
             masks=self.read.masks,
             timing_s=timing,
-            software={"name": "weldscan", "version": __version__, "python": platform.python_version()},
+            software={
+                "name": "weldscan",
+                "version": __version__,
+                "python": platform.python_version(),
+                "numpy": np.__version__,
+                "session_sha256": self.session.sha256,
+            },
         )
 
     def paper_uncertainty_mm(self, expanded_mm: float, cloud: PartCloud | None, hand_eye: HandEye | None) -> float:

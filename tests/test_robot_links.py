@@ -1,6 +1,7 @@
 """Every link against its simulated controller: poses, motion, and one fault after the other."""
 
 import math
+import re
 import socket
 import threading
 import time
@@ -205,6 +206,34 @@ def test_kvp_needs_our_program_running(arm, state):
         with pytest.raises(DeviceError, match="must be running"):
             robot.move_to(NEAR)
         assert close_to(arm.flange(), FLANGE)
+
+
+def single(text):
+    """Every number in single precision, as a controller's REAL."""
+    return re.sub(r"-?\d+\.\d+", lambda number: f"{np.float32(number[0]):.6f}", text)
+
+
+@pytest.mark.parametrize(
+    ("taken", "moves"),
+    [
+        (single, True),
+        (lambda text: text.replace("X 612", "X 622"), False),
+        (lambda text: "{}", False),
+    ],
+)
+def test_kvp_target_as_the_controller_took_it(arm, monkeypatch, taken, moves):
+    controller, robot = connect("kvp", arm, allow_motion=True)
+    original = controller._set
+    monkeypatch.setattr(
+        controller, "_set", lambda name, value: original(name, taken(value) if name == "COM_TARGET" else value)
+    )
+    with controller, robot:
+        if moves:
+            assert distance(robot.move_to(NEAR).flange, NEAR)[0] < 0.1
+        else:
+            with pytest.raises(DeviceError):
+                robot.move_to(NEAR)
+            assert close_to(arm.flange(), FLANGE)
 
 
 def test_still(arm):

@@ -403,6 +403,14 @@ def test_frame_of_the_wrong_size(cell):
     assert not (cell.out / "session.json").exists()
 
 
+def test_camera_of_another_size_than_the_plan_has(cell):
+    for path in (cell.folder / "images").iterdir():
+        cv2.imwrite(str(path), np.pad(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), 8))
+    with pytest.raises(DeviceError, match="64x48 pixels, but the plan's camera has 48x32"):
+        cell.scan()
+    assert not list((cell.out / "shots").iterdir())
+
+
 def test_quality_of_two_exposures():
     """A left half that one exposure saturates and a right half that the other leaves dark are both usable together."""
     frames = np.stack(list(fringe_patterns(FRINGES, WIDTH, HEIGHT))).astype(float)

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from weldscan.devices.controller import Arm, Fault, TcpController
-from weldscan.devices.robot import POLL_S, Reading, Robot, RobotSettings
+from weldscan.devices.robot import POLL_S, Reading, Robot, RobotSettings, distance
 from weldscan.devices.wire import Link, TcpTransport
 from weldscan.errors import DeviceError, DeviceTimeout, InputError
 from weldscan.pose import KukaPose, format_e6axis, format_e6pos, format_frame, parse_e6axis, parse_e6pos, parse_frame
@@ -26,6 +26,8 @@ READ, WRITE, READ_UNICODE, WRITE_UNICODE, READ_MANY, WRITE_MANY = 0, 1, 4, 5, 6,
 HEARTBEAT_S = 20.0
 """The controller hangs up on a client that is silent for 30 s."""
 PROGRAM = "WELDSCAN_KVP"
+SINGLE_MM, SINGLE_DEG = 0.002, 1e-3
+"""A controller keeps REAL in single precision: 0.0005 mm at 10 m, and less than 1e-4 degrees."""
 FRAME_NAMES = ("$TOOL", "$BASE", "$IPO_MODE", "$MODE_OP")
 
 
@@ -176,9 +178,7 @@ class KvpRobot(Robot):
         self._ask(WRITE, [name, value], 1, repeat=False)
 
     def read(self) -> Reading:
-        """Read $POS_ACT between two readings of tool and base, so that a change between them cannot make a wrong
-        pose.
-        """
+        """Read $POS_ACT between two readings of the frames: a change between them cannot make a wrong pose."""
         for _ in range(3):
             before = self.get(*FRAME_NAMES)
             asked_s = time.monotonic()
@@ -216,10 +216,14 @@ class KvpRobot(Robot):
     def _move(self, target: KukaPose, give_up_s: float) -> None:
         """Target first, trigger last; then wait until the program has done it."""
         self._check_program()
-        frame = format_frame(target)
-        self.set("COM_TARGET", frame)
-        if parse_frame(self.get("COM_TARGET")[0]) != target:
-            raise DeviceError(f"{self.name}: the controller did not take the target")
+        self.set("COM_TARGET", format_frame(target))
+        (text,) = self.get("COM_TARGET")
+        try:
+            off_mm, off_deg = distance(parse_frame(text), target)
+        except InputError as error:
+            raise DeviceError(f"{self.name}: COM_TARGET: {error}") from error
+        if off_mm > SINGLE_MM or off_deg > SINGLE_DEG:
+            raise DeviceError(f"{self.name}: the controller took another target: {text}")
         self.set("COM_ACTION", "1")
         while self.get("COM_ACTION")[0].strip() != "0":
             self._check_program()

@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from weldscan.devices.camera import Camera, Image
 from weldscan.devices.projector import Projector
 from weldscan.devices.robot import Robot, StampedPose, distance, wait_until_still
-from weldscan.errors import InputError, WeldscanError
+from weldscan.errors import DeviceError, InputError, WeldscanError
 from weldscan.fringes import flat_pattern, fringe_patterns
 from weldscan.manifest import read_plan
 from weldscan.pose import KukaPose
@@ -193,6 +193,7 @@ class _Scan:
                 wanted_s = self.camera.settings.exposure_s * exposure * factor
                 actual.append(set_exposure(self.camera, self.projector, wanted_s))
                 *frames, white = capture_stack(self.camera, self.projector, self.patterns)
+                self._check_size(white)
                 stacks.append(frames)
                 whites.append(white)
             if len(set(actual)) < len(actual):
@@ -207,6 +208,14 @@ class _Scan:
                 return stacks, whites, self._ratios(shot, actual), {**record, "pose": _flange_pose(before)}
             log.warning("%s: the robot moved by %.3f mm, %.4f degrees meanwhile", shot.name, moved_mm, moved_deg)
         raise Rejected(f"the robot moved by {moved_mm:.3f} mm and {moved_deg:.4f} degrees during the images")
+
+    def _check_size(self, image: Image) -> None:
+        lens = self.plan.scanner.camera
+        if image.shape != (lens.height, lens.width):
+            raise DeviceError(
+                f"{self.camera.name}: frames of {image.shape[1]}x{image.shape[0]} pixels, "
+                f"but the plan's camera has {lens.width}x{lens.height}"
+            )
 
     def _ratios(self, shot: ShotSpec, actual_s: list[float]) -> tuple[float, ...] | None:
         """The exposures as they were, relative to the cell's."""

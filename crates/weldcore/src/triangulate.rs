@@ -128,6 +128,12 @@ fn look(problem: &Problem, q: &[f64; 3], aim: f64, s: f64) -> Look {
 /// Depth along each ray, and its standard deviation.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
 fn solve(problem: &Problem, tile: &mut Tile) {
+    plain_solve(problem, tile);
+}
+
+/// The body of [`solve`], and its fallback.
+#[inline(always)]
+fn plain_solve(problem: &Problem, tile: &mut Tile) {
     let Problem { rotation: r, translation: t, focal, centre, size, .. } = problem;
     for i in 0..TILE {
         let (x, y) = (tile.x[i], tile.y[i]);
@@ -457,6 +463,29 @@ mod tests {
             assert!(cloud.points_mm.iter().all(|p| p[2].is_nan()), "{column}");
         }
         assert!(matches!(triangulate(&[1.0], &scanner, None, Axis::X), Err(Error::Shape { .. })));
+    }
+
+    #[test]
+    fn vectors_and_the_plain_fallback_give_the_same_bits() {
+        let scanner = example();
+        let (column, _) = scene(&scanner, Axis::X);
+        let (problem, rays) = (Problem::new(&scanner, Axis::X), scanner.camera_rays());
+        let start = 100 * 320 + 64;
+        let of = |v: &[f64]| -> [f64; TILE] { v[start..start + TILE].try_into().unwrap() };
+        let tile = || Tile {
+            x: of(&rays.x),
+            y: of(&rays.y),
+            column: of(&column),
+            sigma_px: [0.05; TILE],
+            z: [0.0; TILE],
+            sigma_mm: [0.0; TILE],
+        };
+        let (mut fast, mut plain) = (tile(), tile());
+        solve(&problem, &mut fast);
+        plain_solve(&problem, &mut plain);
+        assert_eq!(fast.z.map(f64::to_bits), plain.z.map(f64::to_bits));
+        assert_eq!(fast.sigma_mm.map(f32::to_bits), plain.sigma_mm.map(f32::to_bits));
+        assert!(fast.z.iter().any(|z| z.is_finite()));
     }
 
     #[test]

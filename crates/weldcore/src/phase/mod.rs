@@ -266,7 +266,8 @@ fn harmonics<T: Level>(shot: &Shot<'_, T>, sets: &[FringeSet], noise: &Noise, sa
         }
         let (mut rest, mut power) = (0.0, 0.0);
         let (wave, mut fit) = (Wave::new(set.steps), Sinusoid::empty());
-        for row in noise::sample_rows(shot.height) {
+        // A quarter of them: thousands of pixels are plenty for a mean.
+        for row in noise::sample_rows(shot.height).step_by(4) {
             let mut start = row * shot.width;
             while start < (row + 1) * shot.width {
                 let len = TILE.min((row + 1) * shot.width - start);
@@ -371,6 +372,12 @@ struct Judge {
 
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
 fn fuse(fit: &Sinusoid, judge: &Judge, first: bool, why: &mut Lane, out: &mut Fused) {
+    plain_fuse(fit, judge, first, why, out);
+}
+
+/// The body of [`fuse`], and its fallback.
+#[inline(always)]
+fn plain_fuse(fit: &Sinusoid, judge: &Judge, first: bool, why: &mut Lane, out: &mut Fused) {
     for i in 0..TILE {
         let (re, im, background) = (fit.re[i], fit.im[i], fit.background[i]);
         let b2 = re * re + im * im;
@@ -402,6 +409,12 @@ fn fuse(fit: &Sinusoid, judge: &Judge, first: bool, why: &mut Lane, out: &mut Fu
 /// Turns the summed phasors of a set into a phase, and keeps the reason where there is none.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
 fn finish(z: f32, why_set: &Lane, set: &mut Fused, why: &mut Lane) {
+    plain_finish(z, why_set, set, why);
+}
+
+/// The body of [`finish`], and its fallback.
+#[inline(always)]
+fn plain_finish(z: f32, why_set: &Lane, set: &mut Fused, why: &mut Lane) {
     let least = z * z;
     for i in 0..TILE {
         let weight = set.weight[i];
@@ -468,6 +481,12 @@ fn judge_order(z: f32, variance: &Lane, miss: &Lane, why: &mut Lane) {
 
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
 fn unwrap(chain: &Chain, work: &mut Work) {
+    plain_unwrap(chain, work);
+}
+
+/// The body of [`unwrap`], and its fallback.
+#[inline(always)]
+fn plain_unwrap(chain: &Chain, work: &mut Work) {
     let sets = &work.sets;
     let Some(finest) = sets.get(chain.finest) else { return };
     let (mut absolute, mut signal, mut variance, mut miss) = ([0.0; TILE], [0.0; TILE], [0.0; TILE], [0.0; TILE]);
@@ -664,5 +683,127 @@ fn count_neighbours(own: &[f64], rows: &[&[f64]], reach: f64, near: &mut [u8], f
                 *far += u8::from(d >= reach);
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn noise(seed: u64) -> impl FnMut() -> f64 {
+        let mut state = seed;
+        move || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1u64 << 53) as f64
+        }
+    }
+
+    const SETS: [FringeSet; 3] = [
+        FringeSet { periods: 59.0, steps: 4 },
+        FringeSet { periods: 64.0, steps: 5 },
+        FringeSet { periods: 70.0, steps: 12 },
+    ];
+
+    /// Images of a slanted wall with some noise, saturation and darkness in it.
+    fn images(width: usize, height: usize) -> Vec<Vec<u8>> {
+        let mut random = noise(7);
+        let mut frames = Vec::new();
+        for set in SETS {
+            for k in 0..set.steps {
+                let frame = (0..width * height).map(|i| {
+                    let x = (i % width) as f64 / width as f64;
+                    let wave = TAU * (set.periods * (0.05 + 0.9 * x) - k as f64 / set.steps as f64);
+                    (160.0 * x * (1.1 + wave.cos()) + 2.0 * random()) as u8
+                });
+                frames.push(frame.collect());
+            }
+        }
+        frames
+    }
+
+    fn bits(lane: &Lane) -> Vec<u32> {
+        lane.iter().map(|v| v.to_bits()).collect()
+    }
+
+    #[test]
+    fn vectors_and_the_plain_fallback_give_the_same_bits() {
+        let frames = images(2 * TILE, 1);
+        let frames: Vec<&[u8]> = frames.iter().map(Vec::as_slice).collect();
+        let shot = Shot { exposures: vec![frames.clone(), frames], width: 2 * TILE, height: 1 };
+        let plan = Plan::new(&SETS.map(|s| s.periods), 5.0).unwrap();
+        let model = Noise { read_variance: 0.5, gain: 0.01, source: NoiseSource::Assumed };
+        let decoder = Decoder::new(&shot, &SETS, &plan, 912, model, 255.0, 5.0);
+        for start in [0, TILE] {
+            let mut fast = Work::new(SETS.len());
+            decoder.tile(start, TILE, &mut fast);
+
+            let mut plain = Work::new(SETS.len());
+            for (i, (at, steps, wave, judge)) in decoder.sets.iter().enumerate() {
+                let mut why_set = [0.0; TILE];
+                for (e, frames) in shot.exposures.iter().enumerate() {
+                    let tiles: Vec<&[u8; TILE]> =
+                        frames[*at..at + steps].iter().map(|f| f[start..start + TILE].try_into().unwrap()).collect();
+                    wave::demodulate(&tiles, wave, &mut plain.fit);
+                    plain_fuse(&plain.fit, judge, e == 0, &mut why_set, &mut plain.sets[i]);
+                }
+                plain_finish(5.0, &why_set, &mut plain.sets[i], &mut plain.why);
+            }
+            plain_unwrap(&decoder.chain, &mut plain);
+            let columns = |w: &Work| w.column.map(f64::to_bits).to_vec();
+            assert_eq!(columns(&fast), columns(&plain));
+            assert_eq!(bits(&fast.sigma), bits(&plain.sigma));
+            assert_eq!(bits(&fast.modulation), bits(&plain.modulation));
+            assert_eq!(bits(&fast.background), bits(&plain.background));
+            assert_eq!(fast.reason, plain.reason);
+            assert!(start == 0 || fast.reason.iter().any(|r| *r == 0));
+        }
+    }
+
+    #[test]
+    fn columns_come_back_on_any_number_of_threads() {
+        let (width, height) = (700, 50);
+        let frames = images(width, height);
+        let shot = Shot { exposures: vec![frames.iter().map(Vec::as_slice).collect()], width, height };
+        let run = || decode_shot(&shot, &SETS, 912, &DecodeOptions::default()).unwrap();
+        crate::threads::set_threads(Some(1)).unwrap();
+        let one = run();
+        crate::threads::set_threads(Some(3)).unwrap();
+        let three = run();
+        crate::threads::set_threads(None).unwrap();
+        assert_eq!(
+            one.column_px.iter().map(|c| c.to_bits()).collect::<Vec<_>>(),
+            three.column_px.iter().map(|c| c.to_bits()).collect::<Vec<_>>()
+        );
+        assert_eq!(one.counts, three.counts);
+        let mut seen = 0;
+        for (i, column) in one.column_px.iter().enumerate().filter(|c| c.1.is_finite()) {
+            let truth = 912.0 * (0.05 + 0.9 * (i % width) as f64 / width as f64) - 0.5;
+            assert!((column - truth).abs() < 6.0 * f64::from(one.sigma_px[i]) + 0.02, "{column} {truth}");
+            seen += 1;
+        }
+        assert!(seen > width * height / 3, "{:?}", one.counts);
+    }
+
+    #[test]
+    fn neighbours_with_another_order_are_jumps() {
+        let mut map = {
+            let frames = images(64, 16);
+            let shot = Shot { exposures: vec![frames.iter().map(Vec::as_slice).collect()], width: 64, height: 16 };
+            decode_shot(&shot, &SETS, 912, &DecodeOptions::default()).unwrap()
+        };
+        map.column_px = (0..64 * 16).map(|i| (i % 64) as f64).collect();
+        map.reason.fill(0);
+        // One alone, a pair, and an edge that stays.
+        for at in [5 * 64 + 10, 8 * 64 + 30, 8 * 64 + 31] {
+            map.column_px[at] += 20.0;
+        }
+        for y in 0..16 {
+            for x in 50..64 {
+                map.column_px[y * 64 + x] += 40.0;
+            }
+        }
+        reject_jumps(&mut map, 7.0);
+        let rejected: Vec<usize> = (0..64 * 16).filter(|&i| map.reason[i] == Reason::OrderInDoubt as u8).collect();
+        assert_eq!(rejected, [5 * 64 + 10, 8 * 64 + 30, 8 * 64 + 31]);
     }
 }

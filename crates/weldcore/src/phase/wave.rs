@@ -92,7 +92,7 @@ fn demodulate_u16(frames: &[&[u16; TILE]], wave: &Wave, out: &mut Sinusoid) {
 
 /// The usual numbers of steps keep all samples of a pixel in registers; the rest go frame by frame.
 #[inline(always)]
-fn demodulate<T: Level>(frames: &[&[T; TILE]], wave: &Wave, out: &mut Sinusoid) {
+pub(crate) fn demodulate<T: Level>(frames: &[&[T; TILE]], wave: &Wave, out: &mut Sinusoid) {
     match frames.len() {
         3 => demodulate_fixed::<T, 3>(frames, wave, out),
         4 => demodulate_four(frames, out),

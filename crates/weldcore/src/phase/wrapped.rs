@@ -49,6 +49,12 @@ fn residual(level: &[f64; TILE], cos: f64, sin: f64, scale: f64, k: &mut Kernel<
 /// Leaves the phase in `re`, the modulation in `im`.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
 fn finish(scale: f64, k: &mut Kernel<'_>) {
+    plain_finish(scale, k);
+}
+
+/// The body of [`finish`], and its fallback.
+#[inline(always)]
+fn plain_finish(scale: f64, k: &mut Kernel<'_>) {
     for i in 0..TILE {
         let (re, im) = (k.re[i], k.im[i]);
         k.re[i] = atan2(im, re);

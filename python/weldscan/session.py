@@ -316,17 +316,14 @@ class Session(_Model):
         return self
 
     def _about_fringes(self) -> Iterator[str]:
-        last: dict[str, float] = {}
+        seen: set[tuple[str, float]] = set()
         for index, fringe in enumerate(self.fringes):
             side = self.scanner.projector.width if fringe.axis == "x" else self.scanner.projector.height
-            before = last.get(fringe.axis, 0.0)
-            if fringe.periods == before:
+            if (fringe.axis, fringe.periods) in seen:
                 yield f"fringes.{index}.periods: {fringe.periods:g} is there twice on axis {fringe.axis}"
-            if fringe.periods < before:
-                yield f"fringes.{index}.periods: {fringe.periods:g} after {before:g}; they should ascend on each axis"
             if 2 * fringe.periods > side:
                 yield f"fringes.{index}.periods: {side} projector pixels cannot show {fringe.periods:g} fringes"
-            last[fringe.axis] = fringe.periods
+            seen.add((fringe.axis, fringe.periods))
 
     def _about_shots(self) -> Iterator[str]:
         seen: dict[str, int] = {}
@@ -353,8 +350,6 @@ class Session(_Model):
             if self.hand_eye is None and not self.artefact_shots:
                 yield "hand_eye: missing, and there are no artefact shots to find it from"
             return
-        if self.robot is not None:
-            yield "shots.0.flange_pose: missing, though the session names a robot"
         if self.hand_eye is not None:
             yield "hand_eye: given, but the shots have no flange_pose to use it with"
         if self.artefact_shots or len(self.part_shots) != 1:

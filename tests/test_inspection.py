@@ -231,6 +231,19 @@ def flatten(shot: Path) -> None:
         cv2.imwrite(str(path), np.full_like(image, 120))
 
 
+@pytest.mark.parametrize("stated_diameter_mm", [630.0, 600.0])
+def test_the_papers_number_carries_its_own_uncertainty(tmp_path, stated_diameter_mm):
+    dim = replace(CELL.photometry, lamp=0.2)
+    cell = replace(CELL, photometry=dim, stated_diameter_mm=stated_diameter_mm)
+    truth = simulate_session(tmp_path / "session", cell)["step_mm"]
+    found = inspect(tmp_path / "session", method="paper")
+    verdict = found.verdicts[0]
+    assert verdict.value_mm == found.step.histogram.step_mm
+    assert abs(verdict.value_mm - truth["mean"]) <= verdict.expanded_uncertainty_mm
+    # A nominal diameter that is wrong can leave the paper's number millimetres off: no reason to reject the weld.
+    assert verdict.verdict is not Verdict.FAIL
+
+
 def test_shots_that_cannot_be_used_are_left_out_and_named(recorded, tmp_path):
     folder, truth, _ = recorded
     session = respelt(folder, tmp_path / "session", lambda _: None)

@@ -170,7 +170,7 @@ class _Run:
             value, expanded, coverage = step.max_abs_mm, step.expanded_uncertainty_mm, step.coverage_deg
             if self.method == "paper":
                 value = None if step.histogram is None else step.histogram.step_mm
-                expanded = self.paper_uncertainty_mm(expanded, cloud, hand_eye)
+                expanded = self.paper_uncertainty_mm(step, cloud, hand_eye)
         part = self.part.model_dump()
         reason = "; ".join(f"{name}: {why}" for name, why in self.left_out) or "method paper gave no answer"
         verdicts = [
@@ -202,15 +202,22 @@ class _Run:
             },
         )
 
-    def paper_uncertainty_mm(self, expanded_mm: float, cloud: PartCloud | None, hand_eye: HandEye | None) -> float:
-        """Expanded, k = 2: the surface's, and that the paper's chain joins shots through the robot, errors and all."""
-        if hand_eye is None or cloud is None or len(self.session.part_shots) < 2:
-            return expanded_mm
-        centre = cloud.points_mm.mean(axis=0)
-        poses = [base_from_flange(shot)[:3, 3] for shot in self.session.part_shots]
-        distance = float(np.mean([np.linalg.norm(centre - pose) for pose in poses]))
-        placing = np.hypot(point_uncertainty_mm(hand_eye, np.array([0.0, 0.0, distance])), POSE_SIGMA_MM)
-        return float(np.hypot(expanded_mm, 2 * placing))
+    def paper_uncertainty_mm(self, step: StepResult, cloud: PartCloud | None, hand_eye: HandEye | None) -> float | None:
+        """Expanded, k = 2: the surface's, the robot through which the paper's chain joins shots, and its bias.
+
+        The bias (nominal radius, magnitudes of noisy distances, the 20 % rule) shows as the difference from the mean
+        magnitude of the profile. It is not corrected, so it adds linearly (GUM F.2.4.5).
+        """
+        if step.histogram is None:
+            return None
+        expanded = step.expanded_uncertainty_mm
+        if hand_eye is not None and cloud is not None and len(self.session.part_shots) > 1:
+            centre = cloud.points_mm.mean(axis=0)
+            poses = [base_from_flange(shot)[:3, 3] for shot in self.session.part_shots]
+            distance = float(np.mean([np.linalg.norm(centre - pose) for pose in poses]))
+            placing = np.hypot(point_uncertainty_mm(hand_eye, np.array([0.0, 0.0, distance])), POSE_SIGMA_MM)
+            expanded = float(np.hypot(expanded, 2 * placing))
+        return expanded + abs(step.histogram.step_mm - float(np.abs(step.step_mm).mean()))
 
 
 BUDGET = (

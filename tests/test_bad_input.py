@@ -113,6 +113,10 @@ def test_a_wrong_image(session, run, tmp_path, name, data, says):
         (lambda d: d["shots"][3]["flange_pose"].update(B=float("nan")), "shots.3.flange_pose.B: NaN is not a number"),
         (lambda d: d["fringes"][1].update(steps=2), "fringes.1.steps: should be greater than or equal to 3, not 2"),
         (lambda d: d["fringes"][2].update(periods=8), "fringes.2.periods: 8 is there twice on axis x"),
+        (
+            lambda d: d["fringes"][0].update(periods=2),
+            "fringes: fringe periods: must be a list that counts",
+        ),
         (lambda d: d["part"].update(wall_thickness=400.0), "part: wall_thickness: 400 mm is not less than"),
     ],
 )

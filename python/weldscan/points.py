@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from weldscan._weldcore import Cloud, PhaseMap, Scanner, decode, triangulate
+from weldscan.errors import InputError
 from weldscan.session import FringeSet, Session, ShotSpec, read_frames
 
 Progress = Callable[[int, int, str], None]
@@ -43,7 +44,11 @@ class PointReader:
         t = self.clock("read", t)
         projector = self.scanner.projector
         size = projector.width if self.axis == "x" else projector.height
-        phase = decode(exposures, [(f.periods, f.steps) for f in self.fringes], size)
+        try:
+            phase = decode(exposures, [(f.periods, f.steps) for f in self.fringes], size)
+        except InputError as error:
+            # The images were checked when they were read: what is left are the fringe sets.
+            raise InputError(f"{self.session.folder / 'session.json'}: fringes: {error}") from None
         t = self.clock("decode", t)
         cloud = triangulate(phase.column_px, self.scanner, phase.sigma_px, self.axis)
         self.clock("triangulate", t)

@@ -28,8 +28,8 @@ KEPT_PART = 0.20
 # A wall's points lie within this many robust sigma of its median centroid distance; weld metal does not.
 WALL_SIGMAS = 3.0
 # Points that take part: every k-th of the combined cloud (the paper's had 150,066), and of them those that ICP needs.
-POINTS = 200_000
-ICP_POINTS = 20_000
+POINTS = 100_000
+ICP_POINTS = 10_000
 # Spacing of the modelled pipe's points. Distances are counted along the model's normals: it does not enter them.
 MODEL_SPACING_MM = 1.0
 

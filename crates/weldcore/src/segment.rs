@@ -160,6 +160,10 @@ const MIN_POINTS_PER_BIN: usize = 8;
 /// How far the real diameter of a pipe may be from its nominal one, relative (the usual delivery tolerance is 1 %). A
 /// radius that the arc does not determine better than this is taken as nominal.
 const DIAMETER_TOLERANCE: f64 = 0.01;
+/// Normals that the coarse frame is found from.
+const COARSE_POINTS: f64 = 20_000.0;
+/// Of every so many points one tells how far the view reaches.
+const RANGE_STRIDE: usize = 16;
 /// Points that the cylinder of the reference wall is fitted to.
 const FIT_POINTS: usize = 40_000;
 
@@ -209,8 +213,8 @@ fn normal(points: &[[f64; 3]], width: usize, row: usize, column: usize, reach: u
 /// refined with the points that agree. Degrees and millimetres suffice, see [`find_walls`].
 fn coarse_frame(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<PipeFrame> {
     // Normals over a twentieth of the radius, at most: the surface must be nearly flat there, and longer is less noisy.
-    let stride = 4;
     let height = points.len() / width;
+    let stride = ((points.len() as f64 / COARSE_POINTS).sqrt() as usize).max(1);
     let reach = (width.min(height) / 100).clamp(1, 8);
     let rows: Vec<usize> = (0..height).step_by(stride).collect();
     let found: Vec<Vec<(Vec3, Vec3)>> = threads::install(|| {
@@ -364,11 +368,13 @@ impl View {
         let unrolled = Unrolled::of(points, frame);
         let gate_mm = GATE_THICKNESSES * nominal.wall_thickness_mm;
         // The camera sees less than half a turn: angles from the middle of the view do not wrap.
-        let (mut c, mut s, mut count) = (0.0, 0.0, 0_usize);
-        for (a, d) in unrolled.angle_rad.iter().zip(&unrolled.deviation_mm) {
-            if f64::from(d.abs()) < gate_mm {
-                (c, s, count) = (c + f64::from(a.cos()), s + f64::from(a.sin()), count + 1);
-            }
+        let near = |d: &f32| f64::from(d.abs()) < gate_mm;
+        let unrolled_count = unrolled.angle_rad.len();
+        let count = unrolled.deviation_mm.iter().filter(|d| near(d)).count();
+        let (mut c, mut s) = (0.0, 0.0);
+        for i in (0..unrolled_count).step_by(RANGE_STRIDE).filter(|&i| near(&unrolled.deviation_mm[i])) {
+            let (sin, cos) = unrolled.angle_rad[i].sin_cos();
+            (c, s) = (c + f64::from(cos), s + f64::from(sin));
         }
         crate::error::require_count("part points near the nominal pipe", 1000, count)?;
         let middle_rad = s.atan2(c);
@@ -385,7 +391,8 @@ impl View {
             medians: Vec::new(),
             noise_mm: 0.0,
         };
-        let (a, z): (Vec<f64>, Vec<f64>) = view.places().map(|(_, a, z, _)| (a, z)).unzip();
+        let (a, z): (Vec<f64>, Vec<f64>) =
+            (0..unrolled_count).step_by(RANGE_STRIDE).filter_map(|i| view.place(i)).map(|(a, z, _)| (a, z)).unzip();
         let (a, z) = (inner_range(a), inner_range(z));
         let spacing = ((a.1 - a.0) * frame.radius_mm * (z.1 - z.0) / count as f64).sqrt();
         if !(spacing.is_finite() && spacing > 0.0) {
@@ -400,11 +407,7 @@ impl View {
         Ok(view)
     }
 
-    /// Points near the pipe: index, angle from the middle of the view, axial coordinate, deviation.
-    fn places(&self) -> impl Iterator<Item = (usize, f64, f64, f64)> + '_ {
-        (0..self.unrolled.angle_rad.len()).filter_map(|i| self.place(i).map(|(a, z, d)| (i, a, z, d)))
-    }
-
+    /// A point near the pipe: angle from the middle of the view, axial coordinate, deviation.
     #[inline]
     fn place(&self, i: usize) -> Option<(f64, f64, f64)> {
         let d = f64::from(self.unrolled.deviation_mm[i]);

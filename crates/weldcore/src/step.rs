@@ -125,6 +125,11 @@ const BIN_DEG: f64 = 2.0;
 const SEEN_PART: f64 = 0.1;
 /// Cells per wall and shot: enough to see the unevenness's correlation, few enough to handle their covariance whole.
 const CELLS_PER_WALL: f64 = 700.0;
+/// Every so many points tell where the middle of an arc is.
+const MIDDLE_STRIDE: usize = 16;
+/// Places around an arc at which the reference wall's correction is tabulated: it is smooth, and linear in between to
+/// 1e-8 of its size.
+const TABLE: usize = 4096;
 /// A cell needs this part of the points of a typical cell.
 const FULL_PART: f64 = 0.25;
 /// Beyond this degree a polynomial over one shot's arc describes dents, which the departure of single bins does better.
@@ -516,9 +521,13 @@ fn is_wall(label: u8) -> Option<bool> {
 /// The arc of a shot's walls, from the middle of what was seen of them.
 fn arc_of(shot: &Shot) -> Result<Arc> {
     let (mut c, mut s, mut count) = (0.0, 0.0, [0_usize; 2]);
-    for (a, l) in shot.angle_rad.iter().zip(shot.labels) {
+    for (i, (a, l)) in shot.angle_rad.iter().zip(shot.labels).enumerate() {
         if let Some(other) = is_wall(*l) {
-            (c, s) = (c + f64::from(a.cos()), s + f64::from(a.sin()));
+            // Any angle about the middle will do to count from.
+            if i % MIDDLE_STRIDE == 0 {
+                let (sin, cos) = a.sin_cos();
+                (c, s) = (c + f64::from(cos), s + f64::from(sin));
+            }
             count[usize::from(other)] += 1;
         }
     }
@@ -730,17 +739,30 @@ fn choose<'a>(model: &impl Fn(Terms) -> Model<'a>, cells: &[Cell], whitener: &Wh
 
 /// Every point's deviation from the corrected reference wall.
 fn corrected(model: &Model, parameters: &DVector<f64>, shot: usize, points: &Shot) -> Vec<f32> {
-    let columns = model.arcs.len() * (CYLINDER + model.shapes());
     let width = CYLINDER + model.shapes();
     let own = &parameters.as_slice()[shot * width..(shot + 1) * width];
+    let arc = &model.arcs[shot];
+    // The correction is f(angle) + axial · g(angle).
+    let table: Vec<[f64; 2]> = (0..=TABLE)
+        .map(|k| {
+            let angle = arc.middle + arc.half * (2.0 * k as f64 / TABLE as f64 - 1.0);
+            let at = |axial: f64| {
+                let mut row = vec![0.0; model.columns()];
+                model.reference_row(shot, angle, axial, &mut row);
+                row[shot * width..(shot + 1) * width].iter().zip(own).map(|(a, b)| a * b).sum::<f64>()
+            };
+            [at(0.0), at(1.0) - at(0.0)]
+        })
+        .collect();
     let indices: Vec<usize> = (0..points.labels.len()).collect();
     threads::map_chunks(&indices, |_, chunk| {
-        let mut row = vec![0.0; columns.max(model.columns())];
         let one = |&i: &usize| {
-            let (angle, axial) = (f64::from(points.angle_rad[i]), f64::from(points.axial_mm[i]));
-            model.reference_row(shot, angle, axial, &mut row);
-            let reference: f64 = row[shot * width..(shot + 1) * width].iter().zip(own).map(|(a, b)| a * b).sum();
-            (f64::from(points.deviation_mm[i]) - reference) as f32
+            let place = (arc.local(f64::from(points.angle_rad[i])) / arc.half + 1.0) / 2.0 * TABLE as f64;
+            // Beyond the walls' arc (nothing of the weld is there) the correction is that of its end.
+            let place = place.clamp(0.0, TABLE as f64 - 1e-9);
+            let (k, part) = (place as usize, place.fract());
+            let blend = |c: usize| table[k][c] + part * (table[k + 1][c] - table[k][c]);
+            (f64::from(points.deviation_mm[i]) - blend(0) - f64::from(points.axial_mm[i]) * blend(1)) as f32
         };
         chunk.iter().map(one).collect::<Vec<f32>>()
     })

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from weldscan.calibration.artefact import TOUCH_SIGMA_MM, PlateMismatch, PlateView, check_side, find_plate
+from weldscan.calibration.artefact import TOUCH_SIGMA_MM, PlateMismatch, PlateView, find_plate
 from weldscan.calibration.hand_eye import (
     POSE_SIGMA_MM,
     POSE_SIGMA_RAD,
@@ -112,15 +112,6 @@ def test_poses_that_contradict_the_plate_are_refused():
         solve_hand_eye(views, poses, touched)
 
 
-def test_a_mirrored_plate_is_refused():
-    views, poses, touched = views_and_poses(1)
-    check_side(views[0], touched, poses[0])
-    mirrored = views[0].centres_mm * [-1.0, 1.0, 1.0]
-    view = PlateView("artefact-1", mirrored, views[0].covariances_mm2, (0.01,) * 3, (5000,) * 3)
-    with pytest.raises(PlateMismatch, match="the plate is mirrored"):
-        check_side(view, touched, poses[0])
-
-
 def caps(centres: np.ndarray, radius_mm: float = 10.0) -> np.ndarray:
     """A (H, W, 3) grid of what a camera with parallel rays 0.25 mm apart sees of spheres before a plane."""
     x, y = np.meshgrid(np.arange(-50, 50, 0.25), np.arange(-50, 50, 0.25))
@@ -133,11 +124,13 @@ def caps(centres: np.ndarray, radius_mm: float = 10.0) -> np.ndarray:
 
 
 IN_VIEW = np.array([[-27.0, -24.0, 415.0], [25.0, -24.0, 413.0], [17.4, 19.3, 416.0]])
+# Base and scanner are one frame here, and the flange is where the scanner is.
+FLANGE = np.eye(4)
 
 
 def test_the_spheres_are_named_by_their_distances():
     order = [2, 0, 1]
-    view = find_plate("artefact-1", caps(IN_VIEW), 20.0, IN_VIEW[order])
+    view = find_plate("artefact-1", caps(IN_VIEW), 20.0, IN_VIEW[order], FLANGE)
     np.testing.assert_allclose(view.centres_mm, IN_VIEW[order], atol=0.01)
 
 
@@ -145,7 +138,7 @@ def test_another_plate_is_refused_with_its_distances():
     longer = IN_VIEW.copy()
     longer[0, 0] -= 1.5
     with pytest.raises(PlateMismatch) as error:
-        find_plate("artefact-1", caps(IN_VIEW), 20.0, longer)
+        find_plate("artefact-1", caps(IN_VIEW), 20.0, longer, FLANGE)
     said = [float(number) for number in re.findall(r"[+-]?\d+\.\d{3}", str(error.value))]
     between = [np.linalg.norm(longer[i] - longer[j]) for i, j in ((0, 1), (1, 2), (2, 0))]
     seen = [np.linalg.norm(IN_VIEW[i] - IN_VIEW[j]) for i, j in ((0, 1), (1, 2), (2, 0))]
@@ -155,4 +148,19 @@ def test_another_plate_is_refused_with_its_distances():
 
 def test_two_spheres_are_not_enough():
     with pytest.raises(GeometryError, match="2 of 3 spheres of 20 mm found"):
-        find_plate("artefact-1", caps(IN_VIEW[:2]), 20.0, IN_VIEW)
+        find_plate("artefact-1", caps(IN_VIEW[:2]), 20.0, IN_VIEW, FLANGE)
+
+
+def test_a_mirrored_plate_is_refused():
+    with pytest.raises(PlateMismatch, match="the plate is mirrored"):
+        find_plate("artefact-1", caps(IN_VIEW), 20.0, IN_VIEW * [-1.0, 1.0, 1.0], FLANGE)
+
+
+def test_two_equal_distances_are_told_apart_by_the_side_and_three_are_not():
+    isosceles = np.array([[-24.0, -20.0, 415.0], [24.0, -20.0, 415.0], [0.0, 22.0, 415.0]])
+    view = find_plate("artefact-1", caps(isosceles), 20.0, isosceles, FLANGE)
+    np.testing.assert_allclose(view.centres_mm, isosceles, atol=0.01)
+    turns = np.radians([90, 210, 330])
+    equilateral = np.stack([28 * np.cos(turns), 28 * np.sin(turns), np.full(3, 415.0)], axis=1)
+    with pytest.raises(PlateMismatch, match="too alike"):
+        find_plate("artefact-1", caps(equilateral), 20.0, equilateral, FLANGE)

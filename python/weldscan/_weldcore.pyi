@@ -468,9 +468,7 @@ def segment_weld(
     axis: Sequence[float] | None = None,
     zero: Sequence[float] | None = None,
 ) -> WeldShot: ...
-def measure_step(
-    shots: Sequence[WeldShot], angle_sigma_rad: float = 0.0, scanner_sigma_mm: float = 0.0
-) -> dict[str, Any]: ...
+def measure_step(shots: Sequence[WeldShot], angle_sigma_rad: float = 0.0) -> dict[str, Any]: ...
 def place_shots(
     shots: Sequence[tuple[WeldShot, NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], int]],
 ) -> tuple[

@@ -5,6 +5,7 @@ Every line of `inspect` is one arrow of the flow; what stands below it only fits
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import time
@@ -24,6 +25,7 @@ from weldscan.calibration.hand_eye import (
     point_uncertainty_mm,
 )
 from weldscan.errors import GeometryError, InputError
+from weldscan.manifest import left_out as left_out_of
 from weldscan.norms import judge, load_norm
 from weldscan.paper_method import paper_step
 from weldscan.points import PointReader, Progress
@@ -33,6 +35,8 @@ from weldscan.session import PartSpec, ShotSpec, read_session
 Floats = NDArray[np.float64]
 DEFAULT_NORMS = ("pnae-g-7-010-89",)
 METHODS = ("surface", "paper")
+# The usual delivery tolerance of a pipe's diameter, and its ovality: beyond twice that the session is asked about.
+DIAMETER_WARNING = 0.02
 
 
 def inspect(
@@ -70,7 +74,7 @@ def inspect(
     # 1-4  the three-sphere plate in every artefact shot: where the scanner sits on the flange
     hand_eye = hand_eye_of(run.read, run.left_out)
     # 5-6  every part shot: its points, its place in base, reference wall, other wall and bead
-    welds = [weld for shot in run.session.part_shots if (weld := run.weld(shot, hand_eye)) is not None]
+    welds = [weld for shot in run.part_shots if (weld := run.weld(shot, hand_eye)) is not None]
     # 7    the step: all shots in one model, each against its own reference wall; and the paper's chain
     step, cloud = run.measure(welds, hand_eye)
     # 8    the verdict
@@ -104,7 +108,9 @@ class _Run:
         self.part: PartSpec = self.session.part
         self.method, self.norms = method, tuple(norms)
         self.read = PointReader(self.session, progress)
-        self.left_out: list[tuple[str, str]] = []
+        self.left_out: list[tuple[str, str]] = list(left_out_of(self.session.folder))
+        unusable = {name for name, _ in self.left_out}
+        self.part_shots = [shot for shot in self.session.part_shots if shot.name not in unusable]
 
     def weld(self, shot: ShotSpec, hand_eye: HandEye | None) -> _Weld | None:
         """Steps 5 and 6: one part shot, placed and segmented; None with the reason kept."""
@@ -125,7 +131,16 @@ class _Run:
             return None
         finally:
             self.read.clock("segment", t)
+        self.check_radius(shot, segmented)
         return _Weld(self.session.part_shots.index(shot), cloud.points_mm, base_from_scanner, segmented)
+
+    def check_radius(self, shot: ShotSpec, segmented: WeldShot) -> None:
+        """Says where the pipe in view is not as thick as the session has it."""
+        seen, told = 2 * segmented.radius_mm, self.part.outside_diameter
+        if abs(seen / told - 1) > DIAMETER_WARNING:
+            self.read.warnings.append(
+                f"{shot.name}: the pipe in view measures {seen:.1f} mm across, but part.outside_diameter is {told:g} mm"
+            )
 
     def measure(self, welds: Sequence[_Weld], hand_eye: HandEye | None) -> tuple[StepResult | None, PartCloud | None]:
         """Step 7, both methods."""
@@ -158,7 +173,7 @@ class _Run:
         turn, shift = weld.base_from_scanner[:3, :3], weld.base_from_scanner[:3, 3]
         origin, axis = turn @ weld.shot.origin_mm + shift, turn @ weld.shot.axis
         try:
-            return paper_step(cloud.points_mm, origin, axis, self.part.outside_diameter / 2)
+            return paper_step(cloud.points_mm, origin, axis, weld.shot.radius_mm)
         except GeometryError as error:
             self.read.warnings.append(f"method paper gave no answer: {error}")
             return None
@@ -215,8 +230,10 @@ class _Run:
             centre = cloud.points_mm.mean(axis=0)
             poses = [base_from_flange(shot)[:3, 3] for shot in self.session.part_shots]
             distance = float(np.mean([np.linalg.norm(centre - pose) for pose in poses]))
-            placing = np.hypot(point_uncertainty_mm(hand_eye, np.array([0.0, 0.0, distance])), POSE_SIGMA_MM)
-            expanded = float(np.hypot(expanded, 2 * placing))
+            placing = math.hypot(
+                point_uncertainty_mm(hand_eye, np.array([0.0, 0.0, distance])), POSE_SIGMA_MM, POSE_SIGMA_RAD * distance
+            )
+            expanded = math.hypot(expanded, 2 * placing)
         return expanded + abs(step.histogram.step_mm - float(np.abs(step.step_mm).mean()))
 
 

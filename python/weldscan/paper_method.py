@@ -41,7 +41,7 @@ def paper_step(points_mm: Floats, axis_point_mm: Floats, axis: Floats, radius_mm
         points_mm: (n, 3) all points of the part, base.
         axis_point_mm: (3,) a point of the pipe's axis: where ICP starts.
         axis: (3,) unit, from the reference wall to the other wall.
-        radius_mm: of the modelled pipe: half the nominal outside diameter.
+        radius_mm: of the modelled pipe: the real one, where the arc shows it.
 
     Raises:
         GeometryError: one of the parts has no points left, or ICP found nothing to hold on to.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from weldscan._weldcore import KdTree
 from weldscan.calibration.artefact import TOUCH_SIGMA_MM
-from weldscan.calibration.hand_eye import POSE_SIGMA_MM, POSE_SIGMA_RAD
+from weldscan.calibration.hand_eye import POSE_SIGMA_MM, POSE_SIGMA_RAD, point_uncertainty_mm
 from weldscan.errors import InputError, NotMeasured
 from weldscan.inspection import inspect
 from weldscan.result import BudgetLine, PartCloud, Validation
@@ -70,7 +70,7 @@ def validate(
     flanges = [(s.flange_pose.X, s.flange_pose.Y, s.flange_pose.Z) for s in session.part_shots if s.flange_pose]
     lever = float(np.mean([np.linalg.norm(touched - np.array(flange), axis=1).min() for flange in flanges]))
     pose = math.hypot(POSE_SIGMA_MM, POSE_SIGMA_RAD * lever)
-    hand_eye = found.hand_eye.working_point_u_mm if found.hand_eye else 0.0
+    hand_eye = point_uncertainty_mm(found.hand_eye, np.array([0.0, 0.0, lever])) if found.hand_eye else 0.0
     shared = (
         BudgetLine("hand-eye", hand_eye, "covariance of the calibration, at the working distance"),
         BudgetLine("robot pose", pose, f"{POSE_SIGMA_MM:g} mm and {POSE_SIGMA_RAD:.1e} rad at {lever:.0f} mm"),

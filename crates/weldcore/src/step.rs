@@ -23,7 +23,7 @@
 //! belong to one wave count twice. The covariance of the parameters is that of the model that includes ΔR and tilt, whether
 //! or not these were admitted. Added in quadrature: the change of the answer when the walls' strips beside the bead are left
 //! out, the correlated unevenness itself (at the seam each wall may stand off its smooth run as far as it does
-//! elsewhere), and whatever the caller knows of (angle, scanner).
+//! elsewhere), and what the caller knows of the angle.
 //!
 //! Sources: GUM (JCGM 100:2008) 5.1; G. Schwarz, Ann. Statist. 6 (1978) 461, eq. 3; P. Diggle and P. Ribeiro, Model-based
 //! Geostatistics (2007), 5.2 for the covariance function of residuals; H. Wendland, Adv. Comput. Math. 4 (1995) 389, φ(3,1).
@@ -57,8 +57,6 @@ pub struct Shot<'a> {
 pub struct Known {
     /// Of the angle about the axis (hand-eye, robot, zero mark), rad.
     pub angle_rad: f64,
-    /// Of the scanner itself between the two sides of a weld, mm.
-    pub scanner_mm: f64,
 }
 
 /// One bin of the profile around the seam.
@@ -677,7 +675,7 @@ pub fn measure(shots: &[Shot], known: &Known) -> Result<Step> {
             - step_at(terms, &chosen.parameters, shot, angle - 1e-4))
             / 2e-4;
         let angle_mm = slope.abs() * known.angle_rad;
-        let parts = [fit_mm, toe_mm, local_mm, angle_mm, unevenness_mm, known.scanner_mm];
+        let parts = [fit_mm, toe_mm, local_mm, angle_mm, unevenness_mm];
         profile.push(Bin {
             angle_deg: BIN_DEG * seen.index as f64,
             seen_at_deg: angle.to_degrees().rem_euclid(360.0),

@@ -43,7 +43,9 @@ def distances(centres_mm: Floats) -> Floats:
     return np.array([np.linalg.norm(centres_mm[i] - centres_mm[j]) for i, j in PAIRS])
 
 
-def find_plate(shot: str, points_mm: Floats, sphere_diameter_mm: float, touched_mm: Floats) -> PlateView:
+def find_plate(
+    shot: str, points_mm: Floats, sphere_diameter_mm: float, touched_mm: Floats, base_from_flange: Floats
+) -> PlateView:
     """Finds the plate's spheres in one shot and names them by their distances.
 
     Args:
@@ -51,10 +53,12 @@ def find_plate(shot: str, points_mm: Floats, sphere_diameter_mm: float, touched_
         points_mm: (H, W, 3) float64, scanner frame, NaN where there is no point.
         sphere_diameter_mm: the calibrated diameter.
         touched_mm: (3, 3), the touched centres in base.
+        base_from_flange: (4, 4), where the flange stood: the scanner on it sees the plate from the same side.
 
     Raises:
         GeometryError: fewer than three spheres of that size are in view.
-        PlateMismatch: three are, but their distances are not the touched ones; the message says by how much.
+        PlateMismatch: three are, but their distances are not the touched ones (the message says by how much), they run
+            the other way round (a mirrored plate), or two distances are too alike to tell the spheres apart.
     """
     found = find_spheres(points_mm, sphere_diameter_mm / 2)
     if len(found) < 3:
@@ -66,12 +70,14 @@ def find_plate(shot: str, points_mm: Floats, sphere_diameter_mm: float, touched_
     def misfit(order: tuple[int, ...]) -> Floats:
         return distances(centres[list(order)]) - wanted
 
-    order = min(permutations(range(len(found)), 3), key=lambda candidate: float(np.square(misfit(candidate)).sum()))
-    off = misfit(order)
-    chosen = list(order)
-    sigma = np.sqrt([np.trace(covariances[order[i]] + covariances[order[j]]) / 3 for i, j in PAIRS])
-    tolerance = SCALE_TOLERANCE * wanted + 5 * np.hypot(sigma, np.sqrt(2) * TOUCH_SIGMA_MM)
-    if np.any(np.abs(off) > tolerance):
+    def tolerance(order: tuple[int, ...]) -> Floats:
+        sigma = np.sqrt([np.trace(covariances[order[i]] + covariances[order[j]]) / 3 for i, j in PAIRS])
+        return np.asarray(SCALE_TOLERANCE * wanted + 5 * np.hypot(sigma, np.sqrt(2) * TOUCH_SIGMA_MM))
+
+    orders = sorted(permutations(range(len(found)), 3), key=lambda order: float(np.square(misfit(order)).sum()))
+    fitting = [order for order in orders if np.all(np.abs(misfit(order)) <= tolerance(order))]
+    if not fitting:
+        off = misfit(orders[0])
         raise PlateMismatch(
             "artefact.centres_base: this is not the plate in view: the distances touched are "
             + ", ".join(f"{d:.3f}" for d in wanted)
@@ -79,6 +85,19 @@ def find_plate(shot: str, points_mm: Floats, sphere_diameter_mm: float, touched_
             + ", ".join(f"{d:+.3f}" for d in off)
             + " mm off"
         )
+    seen = [order for order in fitting if _same_side(centres[list(order)], touched_mm, base_from_flange)]
+    if not seen:
+        raise PlateMismatch(
+            "artefact.centres_base: the plate is mirrored: its spheres run the other way round than those in view, "
+            "though all distances fit"
+        )
+    if len(seen) > 1:
+        raise PlateMismatch(
+            "artefact.centres_base: the distances between the spheres ("
+            + ", ".join(f"{d:.3f}" for d in wanted)
+            + " mm) are too alike to tell which sphere is which"
+        )
+    chosen = list(seen[0])
     return PlateView(
         shot=shot,
         centres_mm=centres[chosen],
@@ -88,19 +107,11 @@ def find_plate(shot: str, points_mm: Floats, sphere_diameter_mm: float, touched_
     )
 
 
-def check_side(view: PlateView, touched_mm: Floats, base_from_flange: Floats) -> None:
-    """The scanner and the flange that carries it look at the same side of the plate; a mirrored plate breaks that.
-
-    Raises:
-        PlateMismatch: `centres_base` lists a mirrored plate.
-    """
+def _same_side(centres_mm: Floats, touched_mm: Floats, base_from_flange: Floats) -> bool:
+    """Whether the scanner and the flange that carries it look at the same side of the plate."""
 
     def side(centres: Floats, eye: Floats) -> float:
         normal = np.cross(centres[1] - centres[0], centres[2] - centres[0])
         return float(np.dot(normal, eye - centres.mean(axis=0)))
 
-    if side(view.centres_mm, np.zeros(3)) * side(touched_mm, base_from_flange[:3, 3]) < 0:
-        raise PlateMismatch(
-            "artefact.centres_base: the plate is mirrored: its spheres run the other way round than those in view, "
-            "though all distances fit"
-        )
+    return side(centres_mm, np.zeros(3)) * side(touched_mm, base_from_flange[:3, 3]) > 0

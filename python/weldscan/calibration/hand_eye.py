@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldscan._weldcore import register_rigid
-from weldscan.calibration.artefact import TOUCH_SIGMA_MM, PlateMismatch, PlateView, check_side, distances, find_plate
+from weldscan.calibration.artefact import TOUCH_SIGMA_MM, PlateMismatch, PlateView, distances, find_plate
 from weldscan.errors import GeometryError, InputError, NotMeasured
 from weldscan.points import PointReader, Progress
 from weldscan.pose import matrix_from_kuka
@@ -262,12 +262,14 @@ def hand_eye_of(read: PointReader, left_out: list[tuple[str, str]]) -> HandEye |
     views: list[PlateView] = []
     poses: list[Floats] = []
     mistaken: PlateMismatch | None = None
+    unusable = {name for name, _ in left_out}
     for shot in session.artefact_shots:
+        if shot.name in unusable:
+            continue
         pose, cloud = base_from_flange(shot), read(shot)
         t = time.perf_counter()
         try:
-            view = find_plate(shot.name, cloud.points_mm, session.artefact.sphere_diameter, touched)
-            check_side(view, touched, pose)
+            view = find_plate(shot.name, cloud.points_mm, session.artefact.sphere_diameter, touched, pose)
         except PlateMismatch as error:
             mistaken = error
             left_out.append((shot.name, str(error)))

@@ -130,19 +130,17 @@ const PROFILE_COLUMNS: [&str; 9] =
 
 /// Measures the step of the other wall over the reference wall on all shots together.
 ///
-/// shots: a list of WeldShot. angle_sigma_rad, scanner_sigma_mm: further standard uncertainties (k = 1) that the caller
-/// knows of. Returns a dict: `mean_mm, median_mm` over the other wall's points, `max_abs_mm, max_abs_at_deg, expanded_mm`
+/// shots: a list of WeldShot. angle_sigma_rad: standard uncertainty of the angle about the axis (k = 1). Returns a dict: `mean_mm, median_mm` over the other wall's points, `max_abs_mm, max_abs_at_deg, expanded_mm`
 /// (k = 2) over the profile, `profile` (n, 9) float64 with the columns `profile_columns`: angle_deg, seen_at_deg,
 /// step_mm, standard_mm and its parts (k = 1); `coverage_deg`, `deviation_mm` (a (H * W,) float32 array per shot, from the
 /// corrected reference wall), and the model's parameters. Raises GeometryError where the walls do not determine it.
 /// Source: `crates/weldcore/src/step.rs`.
 #[pyfunction]
-#[pyo3(signature = (shots, angle_sigma_rad=0.0, scanner_sigma_mm=0.0))]
+#[pyo3(signature = (shots, angle_sigma_rad=0.0))]
 fn measure_step<'py>(
     py: Python<'py>,
     shots: Vec<PyRef<'py, WeldShot>>,
     angle_sigma_rad: f64,
-    scanner_sigma_mm: f64,
 ) -> PyResult<Bound<'py, PyDict>> {
     let views: Vec<Shot> = shots
         .iter()
@@ -155,7 +153,7 @@ fn measure_step<'py>(
             bead_width_mm: s.0.bead_width_mm,
         })
         .collect();
-    let known = Known { angle_rad: angle_sigma_rad, scanner_mm: scanner_sigma_mm };
+    let known = Known { angle_rad: angle_sigma_rad };
     let step = compute(py, || step::measure(&views, &known))?;
     let out = PyDict::new(py);
     out.set_item("mean_mm", step.mean_mm)?;

@@ -157,7 +157,7 @@ def test_a_mirrored_plate_is_refused():
 
 
 def test_two_equal_distances_are_told_apart_by_the_side_and_three_are_not():
-    isosceles = np.array([[-24.0, -20.0, 415.0], [24.0, -20.0, 415.0], [0.0, 22.0, 415.0]])
+    isosceles = np.array([[-24.0, -20.0, 415.0], [24.0, -20.0, 415.0], [0.0, 30.0, 415.0]])
     view = find_plate("artefact-1", caps(isosceles), 20.0, isosceles, FLANGE)
     np.testing.assert_allclose(view.centres_mm, isosceles, atol=0.01)
     turns = np.radians([90, 210, 330])

@@ -70,12 +70,12 @@ def find_plate(
     def misfit(order: tuple[int, ...]) -> Floats:
         return distances(centres[list(order)]) - wanted
 
-    def tolerance(order: tuple[int, ...]) -> Floats:
+    def doubt(order: tuple[int, ...]) -> Floats:
         sigma = np.sqrt([np.trace(covariances[order[i]] + covariances[order[j]]) / 3 for i, j in PAIRS])
-        return np.asarray(SCALE_TOLERANCE * wanted + 5 * np.hypot(sigma, np.sqrt(2) * TOUCH_SIGMA_MM))
+        return np.asarray(5 * np.hypot(sigma, np.sqrt(2) * TOUCH_SIGMA_MM))
 
     orders = sorted(permutations(range(len(found)), 3), key=lambda order: float(np.square(misfit(order)).sum()))
-    fitting = [order for order in orders if np.all(np.abs(misfit(order)) <= tolerance(order))]
+    fitting = [order for order in orders if np.all(np.abs(misfit(order)) <= SCALE_TOLERANCE * wanted + doubt(order))]
     if not fitting:
         off = misfit(orders[0])
         raise PlateMismatch(
@@ -91,7 +91,7 @@ def find_plate(
             "artefact.centres_base: the plate is mirrored: its spheres run the other way round than those in view, "
             "though all distances fit"
         )
-    if len(seen) > 1:
+    if len(seen) > 1 and np.all(np.abs(misfit(seen[1]) - misfit(seen[0])) <= doubt(seen[1])):
         raise PlateMismatch(
             "artefact.centres_base: the distances between the spheres ("
             + ", ".join(f"{d:.3f}" for d in wanted)

@@ -443,10 +443,8 @@ impl View {
             |i: usize| self.place(i).and_then(|(a, z, d)| Some((self.sector(a)? * self.bins + self.bin(z)?, d as f32)));
         let mut starts = vec![0_usize; cells + 1];
         let n = self.unrolled.angle_rad.len();
-        let indices: Vec<usize> = (0..n).collect();
-        let found: Vec<Vec<(u32, f32)>> = threads::map_chunks(&indices, |_, c| {
-            c.iter().filter_map(|&i| cell_of(i).map(|(k, d)| (k as u32, d))).collect()
-        });
+        let found: Vec<Vec<(u32, f32)>> =
+            threads::map_ranges(n, |range| range.filter_map(|i| cell_of(i).map(|(k, d)| (k as u32, d))).collect());
         for (cell, _) in found.iter().flatten() {
             starts[*cell as usize + 1] += 1;
         }
@@ -683,9 +681,8 @@ impl Walls {
             let spread = (self.noise_mm.powi(2) + wall.unevenness_mm2).sqrt();
             ((d - wall.height_mm - wall.slope * z).abs() <= WALL_SIGMAS * spread).then_some(label)
         };
-        let indices: Vec<usize> = (0..view.unrolled.angle_rad.len()).collect();
-        threads::map_chunks(&indices, |_, c| {
-            c.iter().map(|&i| label(i).unwrap_or(Label::None) as u8).collect::<Vec<u8>>()
+        threads::map_ranges(view.unrolled.angle_rad.len(), |range| {
+            range.map(|i| label(i).unwrap_or(Label::None) as u8).collect::<Vec<u8>>()
         })
         .concat()
     }

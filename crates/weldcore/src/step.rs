@@ -752,9 +752,8 @@ fn corrected(model: &Model, parameters: &DVector<f64>, shot: usize, points: &Sho
             [at(0.0), at(1.0) - at(0.0)]
         })
         .collect();
-    let indices: Vec<usize> = (0..points.labels.len()).collect();
-    threads::map_chunks(&indices, |_, chunk| {
-        let one = |&i: &usize| {
+    threads::map_ranges(points.labels.len(), |range| {
+        let one = |i: usize| {
             let place = (arc.local(f64::from(points.angle_rad[i])) / arc.half + 1.0) / 2.0 * TABLE as f64;
             // Beyond the walls' arc (nothing of the weld is there) the correction is that of its end.
             let place = place.clamp(0.0, TABLE as f64 - 1e-9);
@@ -762,7 +761,7 @@ fn corrected(model: &Model, parameters: &DVector<f64>, shot: usize, points: &Sho
             let blend = |c: usize| table[k][c] + part * (table[k + 1][c] - table[k][c]);
             (f64::from(points.deviation_mm[i]) - blend(0) - f64::from(points.axial_mm[i]) * blend(1)) as f32
         };
-        chunk.iter().map(one).collect::<Vec<f32>>()
+        range.map(one).collect::<Vec<f32>>()
     })
     .concat()
 }
@@ -800,15 +799,23 @@ fn seen_bins(shots: &[Shot]) -> Vec<Seen> {
     let turn = (360.0 / BIN_DEG) as usize;
     let mut best: Vec<Option<(f64, Seen)>> = (0..turn).map(|_| None).collect();
     for (k, shot) in shots.iter().enumerate() {
+        let parts = threads::map_ranges(shot.labels.len(), |range| {
+            let mut sums = vec![[(0.0, 0.0); 2]; turn];
+            for (a, l) in shot.angle_rad[range.clone()].iter().zip(&shot.labels[range]) {
+                if let Some(other) = is_wall(*l) {
+                    let index = bin_of(f64::from(*a));
+                    let off = f64::from(*a) - (BIN_DEG * index as f64).to_radians();
+                    let off = off - (off / std::f64::consts::TAU).round() * std::f64::consts::TAU;
+                    let slot: &mut (f64, f64) = &mut sums[index as usize][usize::from(other)];
+                    *slot = (slot.0 + 1.0, slot.1 + off);
+                }
+            }
+            sums
+        });
         let mut sums = vec![[(0.0, 0.0); 2]; turn];
-        for (a, l) in shot.angle_rad.iter().zip(shot.labels) {
-            if let Some(other) = is_wall(*l) {
-                let index = bin_of(f64::from(*a));
-                let centre = (BIN_DEG * index as f64).to_radians();
-                let off = f64::from(*a) - centre;
-                let off = off - (off / std::f64::consts::TAU).round() * std::f64::consts::TAU;
-                let slot = &mut sums[index as usize][usize::from(other)];
-                *slot = (slot.0 + 1.0, slot.1 + off);
+        for part in parts {
+            for (slot, more) in sums.iter_mut().flatten().zip(part.iter().flatten()) {
+                *slot = (slot.0 + more.0, slot.1 + more.1);
             }
         }
         let typical: [f64; 2] = std::array::from_fn(|w| {

@@ -83,6 +83,12 @@ pub fn map_each<T: Sync, R: Send>(items: &[T], job: impl Fn(&T) -> R + Sync) -> 
     install(|| items.par_iter().map(&job).collect())
 }
 
+/// Maps `job(range)` over ranges of [`CHUNK`] indices below `count` in parallel; the results come in the order of the ranges.
+pub fn map_ranges<R: Send>(count: usize, job: impl Fn(std::ops::Range<usize>) -> R + Sync) -> Vec<R> {
+    let range = |k: usize| k * CHUNK..((k + 1) * CHUNK).min(count);
+    install(|| (0..count.div_ceil(CHUNK)).into_par_iter().map(|k| job(range(k))).collect())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

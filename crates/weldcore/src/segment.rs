@@ -625,8 +625,8 @@ fn apart(mut a: Wall, mut b: Wall, bins: usize) -> Option<(Wall, Wall)> {
     Some((a, b))
 }
 
-/// A sector's toe is at most as far out as the median of its neighbourhood: one sector misled by spatter or a hole
-/// does not let weld metal pass for wall.
+/// Each toe becomes the median of its neighbourhood: the seam runs smoothly, and one sector that is misled by spatter, a
+/// hole or a wave of the wall neither lets weld metal pass for wall nor loses a wall.
 fn smooth_toes(pairs: &mut [Option<(Wall, Wall)>]) {
     let around = |k: usize, pick: fn(&(Wall, Wall)) -> usize| {
         let window = &pairs[k.saturating_sub(2)..(k + 3).min(pairs.len())];
@@ -637,8 +637,8 @@ fn smooth_toes(pairs: &mut [Option<(Wall, Wall)>]) {
         (0..pairs.len()).map(|k| (around(k, |p| p.0.toe), around(k, |p| p.1.toe))).collect();
     for (pair, (first, second)) in pairs.iter_mut().zip(limits) {
         if let Some((a, b)) = pair {
-            a.toe = a.toe.min(first);
-            b.toe = b.toe.min(second);
+            a.toe = first;
+            b.toe = second;
         }
     }
 }

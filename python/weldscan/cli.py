@@ -1,4 +1,4 @@
-"""The command line: `weldscan inspect`, `demo`, `calibrate hand-eye`, `validate`.
+"""The command line: `weldscan inspect`, `demo`, `validate`; `calibrate` and the live cell bring theirs.
 
 Heavy imports happen inside the commands, so that `--help` and a typing error answer at once. What went well goes to
 stdout; progress (a bar on a terminal, JSON lines otherwise) and complaints, each in one line, go to stderr.
@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from weldscan._weldcore import __version__
+from weldscan.calibration.cli import register as register_calibrations
 from weldscan.errors import NotMeasured, WeldscanError
 from weldscan.result import Verdict
-from weldscan.station.cli import register
+from weldscan.station.cli import register as register_cell
 
 if TYPE_CHECKING:
     from weldscan.result import Inspection
@@ -60,11 +61,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-calibrate = typer.Typer(
-    help="Calibrations that are kept and used again.", no_args_is_help=True, rich_markup_mode=None, add_completion=False
-)
-app.add_typer(calibrate, name="calibrate")
-
 SessionFolder = Annotated[
     Path, typer.Argument(metavar="SESSION", help="A folder with session.json and shots/ (weldscan-session/1).")
 ]
@@ -149,27 +145,6 @@ def demo(
         print(f"       truth: largest {true['max_abs']:.3f} mm, mean {true['mean']:.3f} mm")
     print(f"       the same again from its images: weldscan inspect {out / 'session'}")
     raise typer.Exit(EXIT_CODES[found.verdict])
-
-
-@calibrate.command("hand-eye", epilog="Example: weldscan calibrate hand-eye plate-shots --out hand-eye.json")
-def calibrate_hand_eye(
-    session: SessionFolder,
-    out: Annotated[Path, typer.Option(help="The file to write; an earlier hand-eye calibration is replaced.")] = Path(
-        "hand-eye.json"
-    ),
-) -> None:
-    """Find where the scanner sits on the robot's flange, from shots of the three-sphere plate, and keep it."""
-    from weldscan.calibration.hand_eye import calibrate as solve
-    from weldscan.session import write_hand_eye
-
-    with _progress() as progress:
-        found = solve(session, progress)
-    write_hand_eye(out, found)
-    print(
-        f"hand-eye {found.id} from {len(found.per_shot)} shots: residual {found.residual_rms_mm:.3f} mm rms, "
-        f"u of a point at the working distance {found.working_point_u_mm:.3f} mm"
-    )
-    print(f'         kept in {out}; a session carries it as "hand_eye": "{out.name}"')
 
 
 @app.command(epilog="Example: weldscan validate pipe-17 --touch pipe-17/touch.csv --out pipe-17-touch")
@@ -274,7 +249,8 @@ def _progress() -> Iterator[Progress]:
         yield show
 
 
-register(app, _progress)
+register_calibrations(app, _progress)
+register_cell(app, _progress)
 
 
 def main() -> None:

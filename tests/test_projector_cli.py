@@ -9,8 +9,8 @@ import typer
 from typer.testing import CliRunner
 
 from weldscan import InputError
-from weldscan.devices.projector import read_response
 from weldscan.fringes import fringe_patterns
+from weldscan.response import read_response
 from weldscan.station.cli import register
 
 
@@ -76,5 +76,5 @@ def test_devices_check_of_the_simulated_cell(tmp_path, run):
     out = tmp_path / "response.json"
     printed = run("devices", "check", "--config", str(config), "--out", str(out)).stdout
     assert "2 refreshes" in printed
-    response = read_response(out)
+    response = read_response(out).table()
     assert np.abs(response - np.arange(256) / 255).max() < 0.02  # this cell's light is linear

@@ -12,6 +12,7 @@ import pytest
 from weldscan import DeviceError, DeviceTimeout, KukaPose
 from weldscan.devices.controller import Arm, Fault
 from weldscan.devices.eki import EkiController, EkiRobot, EkiSettings
+from weldscan.devices.kinematics import ArmGeometry
 from weldscan.devices.kvp import KvpController, KvpRobot, KvpSettings
 from weldscan.devices.robot import distance, wait_until_still
 from weldscan.devices.rsi import RsiController, RsiRobot, RsiSettings
@@ -90,7 +91,20 @@ def test_flange_whichever_tool_and_base(cell, arm):
         pose = robot.pose()
         assert close_to(pose.flange, FLANGE)
         assert before <= pose.time_s <= time.monotonic()
-    assert robot.joints() == pytest.approx(arm.joints_deg)
+    assert robot.joints() == pytest.approx(arm.joints_deg, abs=1e-5)
+
+
+@every_link
+def test_joints_hold_the_flange(cell, arm):
+    _, robot = cell
+    before = robot.joints()
+    arm.place(NEAR)
+    time.sleep(0.02)
+    joints = robot.joints()
+    assert len(joints) == 6
+    assert joints != before
+    # Six decimals of an angle, at the end of an arm of 3 m.
+    assert np.abs(ArmGeometry().flange(joints)[:3, 3] - NEAR.values()[:3]).max() < 1e-3
 
 
 @every_link
@@ -175,6 +189,15 @@ def test_far_targets_are_refused(cell, arm):
     with pytest.raises(DeviceError, match="largest_move_mm"):
         cell[1].move_to(KukaPose(1610.825, *FLANGE.values()[1:]))
     assert close_to(arm.flange(), FLANGE)
+
+
+@pytest.mark.parametrize("link", DISTINCT)
+def test_targets_out_of_reach(link, arm):
+    controller, robot = connect(link, arm, allow_motion=True, largest_move_mm=1e5)
+    with controller, robot:
+        with pytest.raises(DeviceError, match="P_STOP" if link == "kvp" else "out of reach"):
+            robot.move_to(KukaPose(6000.0, *FLANGE.values()[1:]))
+        assert close_to(robot.pose().flange, FLANGE)
 
 
 @moving_cells

@@ -35,9 +35,21 @@ def test_kvp_bytes_of_the_description():
     value = "{E6POS: X 1.0" + " " * 138 + "}"
     reply = kvp.encode_reply(1, kvp.READ, [value])
     assert reply[:7] == bytes.fromhex("00 01 00 9e 00 00 98")
-    assert reply[-3:] == bytes.fromhex("00 01 01")[:0] + bytes.fromhex("00 00 01")
-    published = reply[:-3] + bytes.fromhex("00 01 01")
-    assert kvp.decode_reply(published, 1, kvp.READ) == [value]
+    assert reply[-3:] == bytes.fromhex("00 01 01")
+    # The field before the last byte is 1 in the samples, 0 elsewhere: the last byte alone tells success.
+    for end in ("00 01 01", "00 00 01"):
+        assert kvp.decode_reply(reply[:-3] + bytes.fromhex(end), 1, kvp.READ) == [value]
+    for end in ("00 00 00", "00 01 00"):
+        with pytest.raises(DeviceError, match="refused"):
+            kvp.decode_reply(reply[:-3] + bytes.fromhex(end), 1, kvp.READ)
+
+
+def test_unknown_variable_as_either_program_says_it():
+    empty = bytes.fromhex("00 01 00 06 00 00 00")
+    with pytest.raises(DeviceError, match="empty"):
+        kvp.decode_reply(empty + bytes.fromhex("00 01 01"), 1, kvp.READ)
+    with pytest.raises(DeviceError, match="refused"):
+        kvp.decode_reply(empty + bytes.fromhex("00 00 00"), 1, kvp.READ)
 
 
 def samples():
@@ -66,8 +78,7 @@ def test_published_frames():
         assert kvp.encode_request(number, function, texts) == request
         count = 2 if function in (kvp.READ_MANY, kvp.WRITE_MANY) else 1
         values = kvp.decode_reply(reply, number, function, count)
-        ours = kvp.encode_reply(number, function, values)
-        assert ours[:-3] + reply[-3:] == reply  # the samples fill the error field with 1 on success
+        assert kvp.encode_reply(number, function, values) == reply
     assert known == 6
 
 
@@ -213,14 +224,21 @@ def test_eki_motion_commands():
 def test_eki_over_udp():
     config = EkiConfig.read(shared("robot/eki/EkiHwInterface.xml"))
     assert (config.protocol, len(config.receive), len(config.send)) == ("UDP", 6, 19)
-    with EkiUdpController(config) as controller, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+    arm = Arm()
+    arm.speed_mm_s = arm.turn_speed_deg_s = 1e4
+    with EkiUdpController(config, arm) as controller, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
         peer.settimeout(2.0)
         joints = " ".join(f'A{i}="{i}.5"' for i in range(1, 7))
         peer.sendto(f"<RobotCommand><Pos {joints}/></RobotCommand>".encode(), ("127.0.0.1", controller.port))
-        root = ElementTree.fromstring(peer.recv(4096))
-    assert root.tag == "RobotState"
-    assert root.find("Pos").get("A3") == "3.5"
-    assert root.find("RobotCommand").get("Size") == "0"
+        wanted = pytest.approx([i + 0.5 for i in range(1, 7)])
+
+        def there():
+            root = ElementTree.fromstring(peer.recv(4096))
+            assert root.tag == "RobotState"
+            assert root.find("RobotCommand").get("Size") == "0"
+            return [float(root.find("Pos").get(f"A{i}")) for i in range(1, 7)] == wanted
+
+        wait_for(there)
 
 
 def test_eki_messages_hold_every_element():

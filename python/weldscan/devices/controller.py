@@ -18,13 +18,14 @@ from typing import Self
 
 import numpy as np
 
+from weldscan.devices.kinematics import ArmGeometry, Joints
 from weldscan.devices.robot import distance
 from weldscan.devices.wire import Cut, Messages, TcpTransport, Transport
 from weldscan.errors import DeviceError, DeviceTimeout
 from weldscan.pose import Floats, KukaPose
 
-HOME = KukaPose(600.0, 0.0, 700.0, 0.0, 90.0, 0.0)
-HOME_JOINTS = (0.0, -90.0, 90.0, 0.0, 0.0, 0.0)
+HOME_JOINTS: Joints = (0.0, -90.0, 90.0, 0.0, 30.0, 0.0)
+HOME = KukaPose.from_matrix(ArmGeometry().flange(HOME_JOINTS))
 NULL_FRAME = KukaPose(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 T1_SPEED_MM_S = 250.0
 TURN_SPEED_DEG_S = 90.0
@@ -60,18 +61,24 @@ class Fault(StrEnum):
     """The pose stands at what it was, or the stream repeats itself, although the arm moves."""
 
 
+class OutOfReach(DeviceError):
+    """No way of holding its joints brings the arm there."""
+
+
 class Arm:
-    """The flange of a simulated robot: moves straight at a constant speed, tells $POS_ACT in its tool and base."""
+    """A simulated robot: its flange moves straight at a constant speed and the joints follow; it tells $POS_ACT in its
+    tool and base.
+    """
 
     def __init__(
         self, flange: KukaPose = HOME, tool: KukaPose = NULL_FRAME, base: KukaPose = NULL_FRAME, mode: str = "#T1"
     ) -> None:
         self.tool, self.base, self.mode, self.interpolation = tool, base, mode, "#BASE"
-        self.joints_deg = HOME_JOINTS
+        self._geometry, self._joints = ArmGeometry(), HOME_JOINTS
         self.speed_mm_s, self.turn_speed_deg_s = T1_SPEED_MM_S, TURN_SPEED_DEG_S
-        self._start = self._target = flange
         self._start_s, self._seconds = time.monotonic(), 0.0
         self._frozen: KukaPose | None = None
+        self.place(flange)
 
     def flange(self) -> KukaPose:
         """Return where the flange is now."""
@@ -89,16 +96,31 @@ class Arm:
         """Is the arm on its way?"""
         return time.monotonic() < self._start_s + self._seconds
 
+    @property
+    def joints_deg(self) -> Joints:
+        """A1 to A6 now: of the ways to hold the flange the one nearest to where the joints were."""
+        self._joints = self._geometry.joints(self.flange().matrix(), self._joints) or self._joints
+        return self._joints
+
     def move(self, target: KukaPose) -> None:
-        """Set off for a flange pose."""
+        """Set off for a flange pose. Raises `OutOfReach`, and stays."""
+        if self._geometry.joints(target.matrix(), self._joints) is None:
+            raise OutOfReach(f"{target} is out of the arm's reach")
         self._start = self.flange()
         far_mm, far_deg = distance(self._start, target)
         self._start_s = time.monotonic()
         self._seconds = max(far_mm / self.speed_mm_s, far_deg / self.turn_speed_deg_s)
         self._target = target
 
+    def move_joints(self, joints_deg: Joints) -> None:
+        """Set off for a pose that is given by its joints."""
+        self.move(KukaPose.from_matrix(self._geometry.flange(joints_deg)))
+        self._joints = joints_deg
+
     def place(self, target: KukaPose) -> None:
-        """Be at a pose at once, as when an operator has jogged the arm there."""
+        """Be at a pose at once, as when an operator has jogged the arm there; for a far one the arm is a larger one."""
+        while self._geometry.joints(target.matrix(), self._joints) is None:
+            self._geometry = self._geometry.larger(2.0)
         self._start = self._target = target
         self._seconds = 0.0
 

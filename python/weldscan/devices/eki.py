@@ -7,28 +7,29 @@ has its own FIFO, so both sides always send every element. Configuration and pro
 
 from __future__ import annotations
 
+import contextlib
 import math
 import socket
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 from xml.etree import ElementTree
 
 from pydantic import Field
 
-from weldscan.devices.controller import LOOK_S, Arm, Controller, Fault, TcpController
-from weldscan.devices.robot import Reading, Robot, RobotSettings
-from weldscan.devices.wire import LARGEST_MESSAGE, Link, TcpTransport, Transport, cut_xml, parse_xml
+from weldscan.devices.controller import LOOK_S, Arm, Controller, Fault, OutOfReach, TcpController
+from weldscan.devices.program import LAST_NUMBER, ProgramRobot, Status, carry_out, codes
+from weldscan.devices.robot import RobotSettings
+from weldscan.devices.wire import LARGEST_MESSAGE, TcpTransport, Transport, cut_xml, parse_xml
 from weldscan.errors import DeviceError, InputError
 from weldscan.pose import KukaPose
 
 POSE, MOVE = 1, 2
 """Commands of our program."""
-STATUS = {0: "done", 1: "unknown command", 2: "not in T1", 3: "target out of reach"}
-MODES = {1: "#T1", 2: "#T2", 3: "#AUT", 4: "#EX"}
-INTERPOLATIONS = {1: "#BASE", 2: "#TCP"}
 CARTESIAN = ("X", "Y", "Z", "A", "B", "C")
 JOINTS = ("A1", "A2", "A3", "A4", "A5", "A6")
 STREAM_S = 0.012
@@ -159,72 +160,26 @@ def dissect(elements: tuple[Element, ...], message: bytes) -> dict[Element, str]
 # --- the client -------------------------------------------------------------------------------------------------------
 
 
-class EkiRobot(Robot):
+class EkiRobot(ProgramRobot):
     """A robot behind EthernetKRL with our configuration and program."""
 
     Settings = EkiSettings
     settings: EkiSettings
 
     def __init__(self, settings: EkiSettings) -> None:
-        self.settings = settings
-        self.name = f"EKI {settings.host}:{settings.port}"
-        self._number = 0
-        self._link = Link(
-            self.name,
-            lambda deadline_s: TcpTransport.connect(settings.host, settings.port, deadline_s),
-            cut_xml,
-            settings.timeout_s,
-            settings.reconnect_s,
+        host, port = settings.host, settings.port
+        super().__init__(
+            settings, f"EKI {host}:{port}", partial(TcpTransport.connect, host, port), cut_xml, LAST_NUMBER
         )
-        self._link.open()
 
-    def read(self) -> Reading:
-        """Ask the program for its reading."""
-        asked_s = time.monotonic()
-        status, reading = self._ask(POSE, None, asked_s)
-        if status != 0:
-            raise DeviceError(f"{self.name}: {STATUS.get(status, f'status {status}')}")
-        return reading
+    def _request(self, number: int, target: KukaPose | None) -> bytes:
+        values = [number, MOVE if target else POSE, *(target.values() if target else [0.0] * 6)]
+        return compose(OURS.receive, dict(zip(OURS.receive, map(str, values), strict=True)))
 
-    def close(self) -> None:
-        """Hang up."""
-        self._link.close()
-
-    def _move(self, target: KukaPose, give_up_s: float) -> None:
-        now_s = time.monotonic()
-        status, _ = self._ask(MOVE, target, now_s, repeat=False, timeout_s=give_up_s - now_s)
-        if status != 0:
-            raise DeviceError(f"{self.name}: not moved: {STATUS.get(status, f'status {status}')}")
-
-    def _ask(
-        self,
-        command: int,
-        target: KukaPose | None,
-        asked_s: float,
-        repeat: bool = True,
-        timeout_s: float | None = None,
-    ) -> tuple[int, Reading]:
-        number = self._number = self._number % 1_000_000 + 1
-        numbers = [number, command, *(target.values() if target else [0.0] * 6)]
-        request = compose(OURS.receive, dict(zip(OURS.receive, map(str, numbers), strict=True)))
-
-        def read(message: bytes) -> tuple[int, Reading]:
-            texts = dissect(OURS.send, message)
-            values = [float(texts[element]) for element in OURS.send]
-            replied, status, mode, interpolation = (int(value) for value in values[:4])
-            if replied != number:
-                raise DeviceError(f"reply {replied} to request {number}")
-            return status, Reading(
-                position=KukaPose(*values[4:10]),
-                tool=KukaPose(*values[10:16]),
-                base=KukaPose(*values[16:22]),
-                interpolation=INTERPOLATIONS.get(interpolation, str(interpolation)),
-                mode=MODES.get(mode, str(mode)),
-                time_s=(asked_s + time.monotonic()) / 2,
-                joints_deg=tuple(values[22:28]),
-            )
-
-        return self._link.ask(request, read, repeat, timeout_s)
+    def _reply(self, message: bytes) -> tuple[int, Sequence[float]]:
+        texts = dissect(OURS.send, message)
+        number, *values = (float(texts[element]) for element in OURS.send)
+        return int(number), values
 
 
 # --- the simulated controller -----------------------------------------------------------------------------------------
@@ -258,16 +213,9 @@ class EkiController(TcpController):
             obey(self.arm, values)
             return b""
         number, command, *target = (float(values[element]) for element in self.config.receive)
-        status = 0
+        status = Status.DONE if command == POSE else Status.UNKNOWN_COMMAND
         if command == MOVE:
-            if self.arm.mode == "#T1":
-                self.arm.move(KukaPose(*target))
-                while self.arm.moving and not self._stop.is_set():
-                    time.sleep(0.005)
-            else:
-                status = 2
-        elif command != POSE:
-            status = 1
+            status = carry_out(self.arm, KukaPose(*target), self._stop)
         if fault is Fault.EMPTY:
             return b"<Robot></Robot>"
         shown = int(number) + (1 if fault is Fault.WRONG_ID else 0)
@@ -329,17 +277,13 @@ def state(
     """Return what an arm has to say to every element, found by the names that configurations use; 0 for the others."""
     frames = {"Tool": arm.tool, "Base": arm.base}
     position = arm.position(fault)
-    special = {
-        "Id": number,
-        "Status": status,
-        "Mode": next((code for code, name in MODES.items() if name == arm.mode), 0),
-        "Interpolation": next((code for code, name in INTERPOLATIONS.items() if name == arm.interpolation), 0),
-    }
+    joints_deg, (mode, interpolation) = arm.joints_deg, codes(arm)
+    special = {"Id": number, "Status": int(status), "Mode": mode, "Interpolation": interpolation}
     values = {}
     for element in elements:
         name, group = element.attribute or element.path[-1], element.path[-1]
         if name in JOINTS:
-            value = 0.0 if group in ("Vel", "Eff") else arm.joints_deg[JOINTS.index(name)]
+            value = 0.0 if group in ("Vel", "Eff") else joints_deg[JOINTS.index(name)]
         elif name in CARTESIAN:
             value = frames.get(group, position).values()[CARTESIAN.index(name)]
         else:
@@ -349,12 +293,16 @@ def state(
 
 
 def obey(arm: Arm, values: dict[Element, str]) -> None:
-    """Do what a command of another configuration says: Cartesian motion (types 2 and 3), or joints that are noted."""
+    """Do what a command of another configuration says: Cartesian motion (types 2 and 3), or joints; what the arm
+    cannot reach it does not do.
+    """
     numbers = {(element.path[-1], element.attribute): float(text) for element, text in values.items()}
     kind = numbers.get(("Type", None))
-    if kind in (2.0, 3.0):
-        arm.move(KukaPose(*(numbers[("Cart", name)] for name in CARTESIAN)))
-    else:
-        group = "Axis" if kind == 1.0 else "Pos"
-        if (group, "A1") in numbers:
-            arm.joints_deg = tuple(numbers[(group, name)] for name in JOINTS)  # type: ignore[assignment]
+    with contextlib.suppress(OutOfReach):
+        if kind in (2.0, 3.0):
+            arm.move(KukaPose(*(numbers[("Cart", name)] for name in CARTESIAN)))
+        else:
+            group = "Axis" if kind == 1.0 else "Pos"
+            if (group, "A1") in numbers:
+                a1, a2, a3, a4, a5, a6 = (numbers[(group, name)] for name in JOINTS)
+                arm.move_joints((a1, a2, a3, a4, a5, a6))

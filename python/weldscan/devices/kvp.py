@@ -12,19 +12,24 @@ import struct
 import threading
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from weldscan.devices.controller import Arm, Fault, TcpController
-from weldscan.devices.robot import POLL_S, Reading, Robot, RobotSettings, distance
-from weldscan.devices.wire import Link, TcpTransport
+from weldscan.devices.controller import Arm, Fault, OutOfReach, TcpController
+from weldscan.devices.robot import POLL_S, Reading, RobotSettings, StreamRobot, distance
+from weldscan.devices.wire import TcpTransport
 from weldscan.errors import DeviceError, DeviceTimeout, InputError
 from weldscan.pose import KukaPose, format_e6axis, format_e6pos, format_frame, parse_e6axis, parse_e6pos, parse_frame
 
 READ, WRITE, READ_UNICODE, WRITE_UNICODE, READ_MANY, WRITE_MANY = 0, 1, 4, 5, 6, 7
+LAST_NUMBER = 65_535
+"""Ids have 16 bits."""
 HEARTBEAT_S = 20.0
 """The controller hangs up on a client that is silent for 30 s."""
+DONE, REFUSED = b"\x00\x01\x01", b"\x00\x00\x00"
+"""How a reply ends: a 16-bit field that the published samples fill with 1 and 0, and the byte that tells success."""
 PROGRAM = "WELDSCAN_KVP"
 SINGLE_MM, SINGLE_DEG = 0.002, 1e-3
 """A controller keeps REAL in single precision: 0.0005 mm at 10 m, and less than 1e-4 degrees."""
@@ -77,7 +82,7 @@ def decode_request(frame: bytes) -> tuple[int, int, list[str]]:
     return number, function, texts
 
 
-def encode_reply(number: int, function: int, values: Sequence[str | None], error: int = 0, ok: bool = True) -> bytes:
+def encode_reply(number: int, function: int, values: Sequence[str | None], ok: bool = True) -> bytes:
     """Return a reply; None stands for a variable that could not be read."""
     body = bytes([function])
     if function in (READ_MANY, WRITE_MANY):
@@ -85,7 +90,7 @@ def encode_reply(number: int, function: int, values: Sequence[str | None], error
         body += b"".join(bytes([value is not None]) + _text(value or "", function) for value in values)
     else:
         body += _text(values[0] or "", function)
-    return _head(number, body + struct.pack(">HB", error, ok))
+    return _head(number, body + (DONE if ok else REFUSED))
 
 
 def decode_reply(frame: bytes, number: int, function: int, count: int = 1) -> list[str]:
@@ -146,24 +151,17 @@ def _take_text(data: bytes, function: int) -> tuple[str, bytes]:
 # --- the client -------------------------------------------------------------------------------------------------------
 
 
-class KvpRobot(Robot):
+class KvpRobot(StreamRobot):
     """A robot behind KUKAVARPROXY or C3 Bridge."""
 
     Settings = KvpSettings
     settings: KvpSettings
 
     def __init__(self, settings: KvpSettings) -> None:
-        self.settings = settings
-        self.name = f"KVP {settings.host}:{settings.port}"
-        self._number = 0
-        self._link = Link(
-            self.name,
-            lambda deadline_s: TcpTransport.connect(settings.host, settings.port, deadline_s),
-            cut_frame,
-            settings.timeout_s,
-            settings.reconnect_s,
+        host, port = settings.host, settings.port
+        super().__init__(
+            settings, f"KVP {host}:{port}", partial(TcpTransport.connect, host, port), cut_frame, LAST_NUMBER
         )
-        self._link.open()
         self._closed = threading.Event()
         threading.Thread(target=self._heartbeat, daemon=True).start()
 
@@ -211,7 +209,7 @@ class KvpRobot(Robot):
     def close(self) -> None:
         """Hang up."""
         self._closed.set()
-        self._link.close()
+        super().close()
 
     def _move(self, target: KukaPose, give_up_s: float) -> None:
         """Target first, trigger last; then wait until the program has done it."""
@@ -243,7 +241,7 @@ class KvpRobot(Robot):
             raise DeviceError(f"{self.name}: motion only in T1, the controller says {mode}")
 
     def _ask(self, function: int, texts: Sequence[str], count: int, repeat: bool = True) -> list[str]:
-        number = self._number = self._number % 65535 + 1
+        number = self._next_number()
         request = encode_request(number, function, texts)
         return self._link.ask(request, lambda frame: decode_reply(frame, number, function, count), repeat)
 
@@ -288,7 +286,7 @@ class KvpController(TcpController):
         elif function in (READ, READ_UNICODE, READ_MANY):
             values = [self._get(name.upper(), fault) for name in texts]
         else:
-            return encode_reply(number, function, [None], error=2, ok=False)
+            return encode_reply(number, function, [None], ok=False)
         # An unknown variable: C3 Bridge says so, KUKAVARPROXY answers success with nothing in it.
         ok = not (self.c3 and None in values)
         if fault is Fault.EMPTY:
@@ -300,7 +298,7 @@ class KvpController(TcpController):
 
     def _get(self, name: str, fault: Fault | None) -> str | None:
         arm = self.arm
-        if name == "COM_ACTION" and not arm.moving:
+        if name == "COM_ACTION" and not arm.moving and self.variables["$PRO_STATE1"] == "#P_ACTIVE":
             return "0"
         match name:
             case "$POS_ACT":
@@ -324,4 +322,7 @@ class KvpController(TcpController):
     def _set(self, name: str, value: str) -> None:
         self.variables[name] = value
         if name == "COM_ACTION" and value == "1" and self.arm.mode == "#T1":
-            self.arm.move(parse_frame(self.variables["COM_TARGET"]))
+            try:
+                self.arm.move(parse_frame(self.variables["COM_TARGET"]))
+            except (OutOfReach, InputError):  # the controller stops a program that it cannot go on with
+                self.variables["$PRO_STATE1"] = "#P_STOP"

@@ -7,7 +7,6 @@ top of it.
 from __future__ import annotations
 
 import abc
-import json
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, ClassVar, Self
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from weldscan.errors import DeviceError, InputError
+from weldscan.response import read_response
 
 Pattern = NDArray[np.uint8]
 
@@ -65,7 +65,7 @@ class Projector(abc.ABC):
             raise InputError(f"{self.name}: a pattern of {image.shape} {image.dtype}, not {size} uint8")
         if self.settings.response is not None:
             if self._correction is None:
-                self._correction = correction(read_response(self.settings.response))
+                self._correction = correction(read_response(self.settings.response).table())
             image = self._correction[image]
         return self._show(np.ascontiguousarray(image))
 
@@ -86,33 +86,6 @@ def whole_refreshes(exposure_s: float, refresh_hz: float) -> float:
     0.033333
     """
     return max(round(exposure_s * refresh_hz), 1) / refresh_hz
-
-
-def read_response(path: Path) -> NDArray[np.float64]:
-    """Return the measured light of the levels 0 to 255, scaled to 0..1, from a `weldscan-response/1` file."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        if document["schema"] != "weldscan-response/1":
-            raise InputError(f"{path}: schema: {document['schema']!r}, not weldscan-response/1")
-        level = np.asarray(document["level"], dtype=np.float64)
-        light = np.asarray(document["light"], dtype=np.float64)
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None
-    except (ValueError, KeyError, TypeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: no response table: {error}") from None
-    whole = level.ndim == 1 and level.shape == light.shape and level.size >= 3
-    if not whole or not (
-        np.isfinite(light).all() and level[0] == 0 and level[-1] == 255 and (np.diff(level) > 0).all()
-    ):
-        raise InputError(f"{path}: level should rise from 0 to 255, with a finite light for each")
-    # A display's light never falls with its level; what falls is noise.
-    rising = np.maximum.accumulate(np.interp(np.arange(256), level, light))
-    if not rising[-1] > rising[0]:
-        raise InputError(f"{path}: light: does not rise from black to white")
-    scaled: NDArray[np.float64] = (rising - rising[0]) / (rising[-1] - rising[0])
-    return scaled
 
 
 def correction(response: NDArray[np.float64]) -> Pattern:

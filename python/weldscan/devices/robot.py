@@ -9,6 +9,7 @@ from __future__ import annotations
 import abc
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Annotated, ClassVar, Self
@@ -16,6 +17,7 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from weldscan.devices.wire import Cut, Link, Transport
 from weldscan.errors import DeviceError, DeviceTimeout
 from weldscan.pose import KukaPose
 
@@ -181,6 +183,26 @@ class Robot(abc.ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+class StreamRobot(Robot):
+    """A robot behind a byte stream: numbered questions, one at a time, each with its one reply."""
+
+    def __init__(
+        self, settings: RobotSettings, name: str, connect: Callable[[float], Transport], cut: Cut, last_number: int
+    ) -> None:
+        self.settings, self.name = settings, name
+        self._number, self._last_number = 0, last_number
+        self._link = Link(name, connect, cut, settings.timeout_s, settings.reconnect_s)
+        self._link.open()
+
+    def _next_number(self) -> int:
+        self._number = self._number % self._last_number + 1
+        return self._number
+
+    def close(self) -> None:
+        """Hang up."""
+        self._link.close()
 
 
 def wait_until_still(

@@ -11,21 +11,20 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import serial
 from pydantic import Field
 
 from weldscan.devices.controller import LOOK_S, Arm, Fault, StreamController
-from weldscan.devices.eki import INTERPOLATIONS, MODES, STATUS
-from weldscan.devices.robot import Reading, Robot, RobotSettings
-from weldscan.devices.wire import ConnectionLost, FileTransport, Link
+from weldscan.devices.program import LAST_NUMBER, REPLY_NUMBERS, ProgramRobot, Status, carry_out, codes, numbers
+from weldscan.devices.robot import RobotSettings
+from weldscan.devices.wire import ConnectionLost, FileTransport
 from weldscan.errors import DeviceError, DeviceTimeout
 from weldscan.pose import KukaPose
 
 LONGEST_LINE = 1024
-REPLY_NUMBERS = 3 + 4 * 6
-"""Status, mode, interpolation; position, tool, base, joints."""
 
 
 class SerialSettings(RobotSettings):
@@ -127,68 +126,33 @@ class SerialTransport:
 # --- the client -------------------------------------------------------------------------------------------------------
 
 
-class SerialRobot(Robot):
+class SerialRobot(ProgramRobot):
     """A robot at the end of a serial line, with our program running."""
 
     Settings = SerialSettings
     settings: SerialSettings
 
     def __init__(self, settings: SerialSettings) -> None:
-        self.settings = settings
-        self.name = f"serial {settings.port}"
-        self._number = 0
-        self._link = Link(
-            self.name,
+        super().__init__(
+            settings,
+            f"serial {settings.port}",
             lambda _deadline_s: SerialTransport(settings.port, settings.baud),
             cut_line,
-            settings.timeout_s,
-            settings.reconnect_s,
+            LAST_NUMBER,
         )
-        self._link.open()
 
-    def read(self) -> Reading:
-        """Ask the program for its reading."""
-        status, reading = self._ask("POSE")
-        if status != 0:
-            raise DeviceError(f"{self.name}: {STATUS.get(status, f'status {status}')}")
-        return reading
+    def _request(self, number: int, target: KukaPose | None) -> bytes:
+        words = "POSE" if target is None else "MOVE " + " ".join(f"{value:.6f}" for value in target.values())
+        return encode_line(number, words)
 
-    def close(self) -> None:
-        """Close the port."""
-        self._link.close()
-
-    def _move(self, target: KukaPose, give_up_s: float) -> None:
-        words = "MOVE " + " ".join(f"{value:.6f}" for value in target.values())
-        status, _ = self._ask(words, repeat=False, timeout_s=give_up_s - time.monotonic())
-        if status != 0:
-            raise DeviceError(f"{self.name}: not moved: {STATUS.get(status, f'status {status}')}")
-
-    def _ask(self, words: str, repeat: bool = True, timeout_s: float | None = None) -> tuple[int, Reading]:
-        number = self._number = self._number % 1_000_000 + 1
-        asked_s = time.monotonic()
-
-        def read(line: bytes) -> tuple[int, Reading]:
-            replied, texts = decode_line(line)
-            if replied != number:
-                raise DeviceError(f"reply {replied} to request {number}")
-            if len(texts) != REPLY_NUMBERS:
-                raise DeviceError(f"{len(texts)} numbers for {REPLY_NUMBERS}")
-            try:
-                values = [float(text) for text in texts]
-                status, mode, interpolation = (int(text) for text in texts[:3])
-            except ValueError as error:
-                raise DeviceError(f"not a number: {error}") from error
-            return status, Reading(
-                position=KukaPose(*values[3:9]),
-                tool=KukaPose(*values[9:15]),
-                base=KukaPose(*values[15:21]),
-                interpolation=INTERPOLATIONS.get(interpolation, str(interpolation)),
-                mode=MODES.get(mode, str(mode)),
-                time_s=(asked_s + time.monotonic()) / 2,
-                joints_deg=tuple(values[21:27]),
-            )
-
-        return self._link.ask(encode_line(number, words), read, repeat, timeout_s)
+    def _reply(self, message: bytes) -> tuple[int, Sequence[float]]:
+        number, texts = decode_line(message)
+        if len(texts) != REPLY_NUMBERS:
+            raise DeviceError(f"{len(texts)} numbers for {REPLY_NUMBERS}")
+        try:
+            return number, [*map(int, texts[:3]), *map(float, texts[3:])]
+        except ValueError as error:
+            raise DeviceError(f"not a number: {error}") from error
 
 
 # --- the simulated controller -----------------------------------------------------------------------------------------
@@ -222,21 +186,11 @@ class SerialController(StreamController):
     def answer(self, request: bytes, fault: Fault | None) -> bytes:
         """Do what the line says."""
         number, (command, *words) = decode_line(request)
-        arm, status = self.arm, 0
+        status = Status.DONE if command == "POSE" else Status.UNKNOWN_COMMAND
         if command == "MOVE" and len(words) == 6:
-            if arm.mode == "#T1":
-                arm.move(KukaPose(*(float(word) for word in words)))
-                while arm.moving and not self._stop.is_set():
-                    time.sleep(0.005)
-            else:
-                status = 2
-        elif command != "POSE":
-            status = 1
-        codes = [next((code for code, name in MODES.items() if name == arm.mode), 0)]
-        codes.append(next((code for code, name in INTERPOLATIONS.items() if name == arm.interpolation), 0))
-        frames = [arm.position(fault).values(), arm.tool.values(), arm.base.values(), arm.joints_deg]
-        words = [str(code) for code in (status, *codes)]
-        words += [f"{value:.6f}" for frame in frames for value in frame]
+            status = carry_out(self.arm, KukaPose(*(float(word) for word in words)), self._stop)
+        words = [str(int(code)) for code in (status, *codes(self.arm))]
+        words += [f"{value:.6f}" for value in numbers(self.arm, fault)]
         match fault:
             case Fault.NAN:
                 words[3] = "NaN"

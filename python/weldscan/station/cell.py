@@ -36,8 +36,8 @@ class CellConfig(BaseModel):
         """Where it was read from; file names in it are relative to its folder."""
         return self._path
 
-    def open(self, kind: str, **extra: Any) -> Any:
-        """Open the cell's robot, camera or projector."""
+    def open(self, kind: str, **changes: Any) -> Any:
+        """Open the cell's robot, camera or projector, with some of its settings changed."""
         section = getattr(self, kind)
         if section is None:
             raise InputError(f"{self.path}: {kind}: missing")
@@ -46,7 +46,9 @@ class CellConfig(BaseModel):
         if name not in BACKENDS[kind]:
             raise InputError(f"{self.path}: {kind}.{selector}: {name!r} is none of {', '.join(BACKENDS[kind])}")
         device = backend(kind, name)
-        return device(check(section, device.Settings, f"{self.path}: {kind}"), **extra)
+        settings = check(section, device.Settings, f"{self.path}: {kind}")
+        here = {name: self.path.parent / value for name, value in settings if isinstance(value, Path)}
+        return device(settings.model_copy(update=here | changes))
 
     def open_robot(self) -> Robot:
         """Open the robot."""

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from weldscan.devices.camera import Camera, Image
 from weldscan.devices.projector import Projector
 from weldscan.errors import DeviceError, DeviceTimeout
 from weldscan.fringes import flat_pattern
+from weldscan.response import Response, measured
 from weldscan.station.capture import full_scale, set_exposure
 
 LONGEST_LATENCY_S = 2.0
@@ -56,8 +56,8 @@ def latency_s(camera: Camera, projector: Projector, repeats: int = 5) -> tuple[f
     return tuple(found)
 
 
-def response(camera: Camera, projector: Projector, levels: int = 18, frames: int = 3) -> dict[str, Any]:
-    """Return a `weldscan-response/1` document: the light that the camera sees at levels from 0 to 255."""
+def response(camera: Camera, projector: Projector, levels: int = 18, frames: int = 3) -> Response:
+    """Return the response: the light that the camera sees at levels from 0 to 255."""
     black, white = _flats(camera, projector)
     top = full_scale(white)
     lit = (white < top) & (white.astype(np.int64) - black > LEAST_CONTRAST * top)
@@ -68,12 +68,12 @@ def response(camera: Camera, projector: Projector, levels: int = 18, frames: int
     for level in shown:
         _show(projector, int(level))
         light.append(float(np.mean([camera.capture().image[lit].mean() for _ in range(frames)])))
-    return {"schema": "weldscan-response/1", "level": shown.tolist(), "light": light}
+    return measured(shown, light)
 
 
-def gamma(document: dict[str, Any]) -> float:
+def gamma(response: Response) -> float:
     """Return the exponent of the power law that fits a response best: 1 is linear."""
-    level, light = (np.asarray(document[key], float) for key in ("level", "light"))
+    level, light = np.asarray(response.level), np.asarray(response.light)
     x, y = level / 255, (light - light[0]) / (light[-1] - light[0])
     used = (x > 0.05) & (x < 1) & (y > 0.01)
     return float(np.sum(np.log(x[used]) * np.log(y[used])) / np.sum(np.log(x[used]) ** 2))

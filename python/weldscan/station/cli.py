@@ -207,15 +207,22 @@ def project(
 @devices_app.command("check")
 def devices_check(
     config: Config = CELL,
-    out: Annotated[Path, typer.Option(help="Where the response table goes.")] = Path("response.json"),
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Where the response table goes. Default: response.json beside CONFIG."),
+    ] = None,
 ) -> None:
-    """Measure latency, response, saturated and dark pixels of projector and camera."""
+    """Measure latency, response, saturated and dark pixels of projector and camera.
+
+    The response is the projector's own: a table that the configuration has already is not applied.
+    """
     from weldscan.manifest import replace_durably, to_bytes
     from weldscan.station import check
     from weldscan.station.cell import read_cell
 
     cell = read_cell(config)
-    with cell.open("projector") as projector, cell.open("camera") as camera:
+    out = out if out is not None else config.parent / "response.json"
+    with cell.open("projector", response=None) as projector, cell.open("camera") as camera:
         exposure_s = check.prepare(camera, projector)
         print(f"exposure   {exposure_s * 1000:.3f} ms, {exposure_s * projector.settings.refresh_hz:.0f} refreshes")
         seconds = check.latency_s(camera, projector)
@@ -223,8 +230,9 @@ def devices_check(
         shares = check.pixels(camera, projector)
         print(f"pixels     saturated {shares.saturated:.2%}, dark {shares.dark:.2%}")
         table = check.response(camera, projector)
-        replace_durably(out, to_bytes(table))
-        print(f'response   gamma {check.gamma(table):.3f}; [projector] response = "{out}" corrects it')
+        replace_durably(out, to_bytes(table.document()))
+        named = out.name if out.parent == config.parent else out.resolve()
+        print(f'response   gamma {check.gamma(table):.3f}, in {out}; [projector] response = "{named}" corrects it')
 
 
 def scan(

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from weldscan._weldcore import WeldShot, __version__, measure_step, place_shots, segment_weld
 from weldscan.calibration.hand_eye import (
-    POSE_SIGMA_MM,
-    POSE_SIGMA_RAD,
     base_from_flange,
     hand_eye_of,
     point_uncertainty_mm,
+    pose_sigma,
 )
 from weldscan.errors import GeometryError, InputError
 from weldscan.manifest import left_out as left_out_of
@@ -150,7 +149,7 @@ class _Run:
         angle_sigma = 0.0
         if hand_eye is not None:
             turn = float(np.linalg.eigvalsh(hand_eye.covariance[:3, :3]).max())
-            angle_sigma = float(np.sqrt(max(turn, 0.0) + POSE_SIGMA_RAD**2))
+            angle_sigma = float(np.sqrt(max(turn, 0.0) + pose_sigma(hand_eye)[1] ** 2))
         try:
             step = measure_step([weld.shot for weld in welds], angle_sigma_rad=angle_sigma)
         except GeometryError as error:
@@ -230,8 +229,9 @@ class _Run:
             centre = cloud.points_mm.mean(axis=0)
             poses = [base_from_flange(shot)[:3, 3] for shot in self.session.part_shots]
             distance = float(np.mean([np.linalg.norm(centre - pose) for pose in poses]))
+            pose_mm, pose_rad = pose_sigma(hand_eye)
             placing = math.hypot(
-                point_uncertainty_mm(hand_eye, np.array([0.0, 0.0, distance])), POSE_SIGMA_MM, POSE_SIGMA_RAD * distance
+                point_uncertainty_mm(hand_eye, np.array([0.0, 0.0, distance])), pose_mm, pose_rad * distance
             )
             expanded = math.hypot(expanded, 2 * placing)
         return expanded + abs(step.histogram.step_mm - float(np.abs(step.step_mm).mean()))

@@ -160,14 +160,20 @@ class FringeSet(_Model):
 
 
 class ArtefactSpec(_Model):
-    """The plate with three calibrated spheres; `centres_base` were touched with the robot's probe."""
+    """The plate with three calibrated spheres; `centres_base` were touched with the robot's probe, where they were."""
 
     kind: Literal["three-sphere plate"] = "three-sphere plate"
     sphere_diameter: Positive
-    centres_base: tuple[Vector, Vector, Vector]
+    centres_base: tuple[Vector, Vector, Vector] | None = None
+    touch_sigma_mm: Positive | None = None
+    """Standard uncertainty of a touched centre, each coordinate, its own (k = 1)."""
+    touch_bias_sigma_mm: Positive | None = None
+    """And common to all three."""
 
     @model_validator(mode="after")
     def _is_a_triangle(self) -> Self:
+        if self.centres_base is None:
+            return self
         centres = np.asarray(self.centres_base)
         for i, j in ((0, 1), (1, 2), (2, 0)):
             distance = float(np.linalg.norm(centres[i] - centres[j]))
@@ -218,9 +224,13 @@ class PartSpec(_Model):
 
 
 class RobotSpec(_Model):
-    """Which robot carried the scanner."""
+    """Which robot carried the scanner, and how well its poses are known (k = 1)."""
 
     model: Annotated[str, Field(max_length=200)]
+    pose_sigma_mm: Positive | None = None
+    """Standard uncertainty of the flange's place over the poses of a calibration, each axis."""
+    pose_sigma_deg: Positive | None = None
+    """And of its direction, about each axis."""
 
 
 class FlangePose(_Model):
@@ -263,6 +273,15 @@ class HandEyeSpec(_Model):
     reduced_chi2: Annotated[float, Field(ge=0)] | None = None
     working_point_u_mm: Annotated[float, Field(ge=0)] | None = None
     touched_distances_mm: tuple[float, ...] | None = None
+    pose_sigma_mm: Annotated[float, Field(ge=0)] | None = None
+    """Of a flange pose, each axis, as the shots had it; what is placed through the robot carries it."""
+    pose_sigma_rad: Annotated[float, Field(ge=0)] | None = None
+    sphere_sigma_ratio: Annotated[float, Field(ge=0)] | None = None
+    centres_base_mm: Matrix | None = None
+    probe_bias_mm: Vector | None = None
+    probe_bias_u_mm: Vector | None = None
+    tilts_deg: tuple[float, float] | None = None
+    warnings: tuple[str, ...] = ()
     per_shot: tuple[dict[str, Any], ...] = ()
     """For the record; nothing reads it."""
 
@@ -422,6 +441,9 @@ def write_hand_eye(path: str | os.PathLike[str], hand_eye: HandEye) -> HandEyeSp
             "shot": shot.shot,
             "residual_rms_mm": shot.residual_rms_mm,
             "left_out_error_mm": shot.left_out_error_mm,
+            "chi2": shot.chi2,
+            "outlier": shot.outlier,
+            "residual_mm": [sphere.residual_mm for sphere in shot.spheres],
             "distances_mm": shot.distances_mm,
             "rms_mm": [sphere.rms_mm for sphere in shot.spheres],
             "points": [sphere.points for sphere in shot.spheres],

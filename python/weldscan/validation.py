@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from weldscan._weldcore import KdTree
 from weldscan.calibration.artefact import TOUCH_SIGMA_MM
-from weldscan.calibration.hand_eye import POSE_SIGMA_MM, POSE_SIGMA_RAD, point_uncertainty_mm
+from weldscan.calibration.hand_eye import point_uncertainty_mm, pose_sigma
 from weldscan.errors import InputError, NotMeasured
 from weldscan.inspection import inspect
 from weldscan.result import BudgetLine, PartCloud, Validation
@@ -69,11 +69,12 @@ def validate(
         raise NotMeasured("; ".join(judgement.reason for judgement in found.verdicts) or "nothing was scanned")
     flanges = [(s.flange_pose.X, s.flange_pose.Y, s.flange_pose.Z) for s in session.part_shots if s.flange_pose]
     lever = float(np.mean([np.linalg.norm(touched - np.array(flange), axis=1).min() for flange in flanges]))
-    pose = math.hypot(POSE_SIGMA_MM, POSE_SIGMA_RAD * lever)
+    pose_mm, pose_rad = pose_sigma(found.hand_eye)
+    pose = math.hypot(pose_mm, pose_rad * lever)
     hand_eye = point_uncertainty_mm(found.hand_eye, np.array([0.0, 0.0, lever])) if found.hand_eye else 0.0
     shared = (
         BudgetLine("hand-eye", hand_eye, "covariance of the calibration, at the working distance"),
-        BudgetLine("robot pose", pose, f"{POSE_SIGMA_MM:g} mm and {POSE_SIGMA_RAD:.1e} rad at {lever:.0f} mm"),
+        BudgetLine("robot pose", pose, f"{pose_mm:.3f} mm and {pose_rad:.1e} rad at {lever:.0f} mm"),
     )
     return hold_against(touched, cloud, shared, session=found.session, touch=str(touch_csv), software=found.software)
 

@@ -44,7 +44,7 @@ def distances(centres_mm: Floats) -> Floats:
 
 
 def find_plate(
-    shot: str, points_mm: Floats, sphere_diameter_mm: float, touched_mm: Floats, base_from_flange: Floats
+    shot: str, points_mm: Floats, sphere_diameter_mm: float, touched_mm: Floats | None, base_from_flange: Floats
 ) -> PlateView:
     """Finds the plate's spheres in one shot and names them by their distances.
 
@@ -52,7 +52,7 @@ def find_plate(
         shot: its name, for messages.
         points_mm: (H, W, 3) float64, scanner frame, NaN where there is no point.
         sphere_diameter_mm: the calibrated diameter.
-        touched_mm: (3, 3), the touched centres in base.
+        touched_mm: (3, 3), the touched centres in base; None: any three spheres, in any order.
         base_from_flange: (4, 4), where the flange stood: the scanner on it sees the plate from the same side.
 
     Raises:
@@ -65,6 +65,10 @@ def find_plate(
         raise GeometryError(f"{len(found)} of 3 spheres of {sphere_diameter_mm:g} mm found")
     centres = np.array([sphere.center_mm for sphere in found])
     covariances = np.array([sphere.covariance for sphere in found])
+    if touched_mm is None:
+        if len(found) > 3:
+            raise GeometryError(f"{len(found)} spheres of {sphere_diameter_mm:g} mm found, and none was touched")
+        touched_mm, base_from_flange = centres, np.eye(4)
     wanted = distances(touched_mm)
 
     def misfit(order: tuple[int, ...]) -> Floats:
@@ -85,7 +89,7 @@ def find_plate(
             + ", ".join(f"{d:+.3f}" for d in off)
             + " mm off"
         )
-    seen = [order for order in fitting if _same_side(centres[list(order)], touched_mm, base_from_flange)]
+    seen = [order for order in fitting if same_side(centres[list(order)], touched_mm, base_from_flange)]
     if not seen:
         raise PlateMismatch(
             "artefact.centres_base: the plate is mirrored: its spheres run the other way round than those in view, "
@@ -107,7 +111,36 @@ def find_plate(
     )
 
 
-def _same_side(centres_mm: Floats, touched_mm: Floats, base_from_flange: Floats) -> bool:
+def order_complaint(view: PlateView, reference_mm: Floats, touched: bool) -> str | None:
+    """What is wrong with the order of a view's spheres: permuted, or another plate; None where their distances fit.
+
+    Args:
+        view: the centres as they were named.
+        reference_mm: (3, 3), the centres that they should be, in any frame.
+        touched: whether these were touched, or are another shot's.
+    """
+    centres, wanted = view.centres_mm, distances(reference_mm)
+    spread = np.trace(view.covariances_mm2, axis1=1, axis2=2) / 3
+    sigma = np.sqrt([spread[i] + spread[j] for i, j in PAIRS])
+    doubt = SCALE_TOLERANCE * wanted + 5 * np.hypot(sigma, np.sqrt(2) * TOUCH_SIGMA_MM)
+
+    def misfit(order: tuple[int, ...]) -> Floats:
+        return distances(centres[list(order)]) - wanted
+
+    orders = sorted(permutations(range(3)), key=lambda order: float(np.square(misfit(order)).sum()))
+    if np.all(np.abs(misfit((0, 1, 2))) <= doubt):
+        return None
+    best, said = orders[0], "touched" if touched else "those of the first shot"
+    if np.all(np.abs(misfit(best)) <= doubt):
+        order = ", ".join(str(i + 1) for i in best)
+        worst = float(np.abs(misfit((0, 1, 2))).max())
+        return f"its spheres are permuted: as named, a distance is {worst:.3f} mm off; in the order {order} they fit {said}"
+    return (
+        f"this is not the plate in view: its distances are {', '.join(f'{d:+.3f}' for d in misfit(best))} mm off {said}"
+    )
+
+
+def same_side(centres_mm: Floats, touched_mm: Floats, base_from_flange: Floats) -> bool:
     """Whether the scanner and the flange that carries it look at the same side of the plate."""
 
     def side(centres: Floats, eye: Floats) -> float:

@@ -158,6 +158,13 @@ def _hand_eye(hand_eye: HandEye | None) -> dict[str, Any] | None:
         "residual_rms_mm": hand_eye.residual_rms_mm,
         "reduced_chi2": hand_eye.reduced_chi2,
         "working_point_u_mm": hand_eye.working_point_u_mm,
+        "pose_sigma_mm": hand_eye.pose_sigma_mm,
+        "pose_sigma_rad": hand_eye.pose_sigma_rad,
+        "sphere_sigma_ratio": hand_eye.sphere_sigma_ratio,
+        "probe_bias_mm": hand_eye.probe_bias_mm,
+        "probe_bias_u_mm": hand_eye.probe_bias_u_mm,
+        "tilts_deg": hand_eye.tilts_deg,
+        "warnings": hand_eye.warnings,
         "touched_distances_mm": hand_eye.touched_distances_mm,
         "per_shot": [artefact_shot(shot) for shot in hand_eye.per_shot],
     }
@@ -169,6 +176,8 @@ def artefact_shot(shot: ArtefactShot) -> dict[str, Any]:
         "shot": shot.shot,
         "residual_rms_mm": shot.residual_rms_mm,
         "left_out_error_mm": shot.left_out_error_mm,
+        "chi2": shot.chi2,
+        "outlier": shot.outlier,
         "distances_mm": shot.distances_mm,
         "spheres": [
             {

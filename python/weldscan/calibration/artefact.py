@@ -134,7 +134,7 @@ def order_complaint(view: PlateView, reference_mm: Floats, touched: bool) -> str
     if np.all(np.abs(misfit(best)) <= doubt):
         order = ", ".join(str(i + 1) for i in best)
         worst = float(np.abs(misfit((0, 1, 2))).max())
-        return f"its spheres are permuted: as named, a distance is {worst:.3f} mm off; in the order {order} they fit {said}"
+        return f"its spheres are permuted: a distance is {worst:.3f} mm off; in the order {order} they fit {said}"
     return (
         f"this is not the plate in view: its distances are {', '.join(f'{d:+.3f}' for d in misfit(best))} mm off {said}"
     )

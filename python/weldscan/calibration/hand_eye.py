@@ -58,8 +58,8 @@ Floats = NDArray[np.float64]
 # The robot's pose, k = 1, where the session does not state it. A repeatability of 0.03 mm (the paper's Table 3) is
 # three sigma by ISO 9283; what counts here is how far poses that look at the plate from all sides are off against each
 # other, an arm's accuracy over a few decimetres: taken as three times that sigma. The angle is the same over the
-# 300 mm of the last links. Both are known to 41 % only, so that one shot alone carries 1.7 times as much; where there are more shots they
-# say how good the robot is (docs/decisions/0007).
+# 300 mm of the last links. Both are known to 41 % only, so that one shot alone carries 1.7 times as much; where there
+# are more shots, these say how good the robot is (docs/decisions/0007).
 POSE_SIGMA_MM = 0.03
 POSE_SIGMA_RAD = POSE_SIGMA_MM / 300
 # Bias that all touches share (probe length, ball radius), mm, k = 1.

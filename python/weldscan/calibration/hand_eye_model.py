@@ -6,11 +6,11 @@ the centres c_j in base: 15 numbers. Shot i gives r_ij = X m_ij - F_i^-1 c_j, ni
     V_i = f_s blockdiag(X Cov(m_ij) X^T) + f_t sigma_t^2 J_t J_t^T + f_r sigma_r^2 J_r J_r^T,
 
 J_t and J_r moving all three by a small motion of the flange. Touched centres are a prior with the covariance
-f_c sigma_c^2 I + f_b sigma_b^2 (ones x I). The sigmas are what was stated of sphere fits, robot and probe; the factors f
-are 1 where that is right. Each has a scaled inverse chi-square prior, whose degrees of freedom say how well it is known
-beforehand. With X integrated out (restricted likelihood)
-the shots correct them, and what they leave open of the factors is integrated out in turn: the covariance is that of
-the posterior, and 95 % intervals from it are as wide as Student's where the shots are few.
+f_c sigma_c^2 I + f_b sigma_b^2 (ones x I). The sigmas are what was stated of sphere fits, robot and probe; the factors
+f are 1 where that is right. Each has a scaled inverse chi-square prior, whose degrees of freedom say how well it is
+known beforehand. With X integrated out (restricted likelihood) the shots correct them, and what they leave open of the
+factors is integrated out in turn: the covariance is that of the posterior, and 95 % intervals from it are as wide as
+Student's where the shots are few.
 
 Sources: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545 for the restricted likelihood; H. Rue, S. Martino,
 N. Chopin, J. R. Statist. Soc. B 71 (2009) 319 for integrating variances out on a few nodes about their mode;

@@ -3,6 +3,7 @@ in."""
 
 import shutil
 import subprocess
+import threading
 import time
 
 import cv2
@@ -201,6 +202,53 @@ def test_aravis_no_such_camera():
     camera = backend("camera", "aravis")
     with pytest.raises(DeviceError, match="open"):
         camera(camera.Settings(device="No-Such-Camera"))
+
+
+# --- hardware trigger -------------------------------------------------------------------------------------------------
+
+
+def trigger_of(name, device):
+    """What a projector does at every refresh: the simulated cameras know no other trigger input than their command."""
+    return device._camera.software_trigger if name == "aravis" else device._camera.ExecuteSoftwareTrigger
+
+
+@pytest.mark.parametrize("name", ["aravis", "pylon"])
+def test_hardware_trigger(name, tmp_path, request, monkeypatch):
+    """Frames from before the question are not given, however many the driver holds."""
+    for number in range(250):
+        cv2.imwrite(str(tmp_path / f"{number:03d}.png"), np.full((HEIGHT, WIDTH), number, np.uint8))
+    settings = {"trigger": "hardware", "trigger_line": "Software", "exposure_s": 0.002}
+    with open_camera(name, tmp_path, request, monkeypatch, **settings) as camera:
+        fire, stop, fired = trigger_of(name, camera), threading.Event(), []
+
+        def refresh():
+            while not stop.wait(0.03):
+                fire()
+                fired.append(time.monotonic())
+
+        projector = threading.Thread(target=refresh)
+        projector.start()
+        try:
+            first = camera.capture()
+            time.sleep(0.6)  # and the queue fills: pylon holds 10
+            before = len(fired)
+            frame = camera.capture()
+            assert before + 1 <= len(fired)
+            if name == "pylon":  # its images are numbered
+                assert frame.image[0, 0] > first.image[0, 0] + 10
+        finally:
+            stop.set()
+            projector.join()
+
+
+@pytest.mark.parametrize("name", ["aravis", "pylon"])
+def test_hardware_trigger_that_does_not_come(name, scene, request, monkeypatch):
+    line = {"trigger_line": "Software"} if name == "aravis" else {}  # the fake camera has no input
+    with open_camera(name, scene, request, monkeypatch, trigger="hardware", timeout_s=0.5, **line) as camera:
+        start = time.monotonic()
+        with pytest.raises(DeviceTimeout):
+            camera.capture()
+        assert time.monotonic() - start < 2.0
 
 
 # --- OpenCV -----------------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import time
 
@@ -12,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from weldscan import DeviceError, InputError
-from weldscan.devices import backend
+from weldscan import DeviceError, DeviceTimeout, InputError
+from weldscan.devices import backend, window
 from weldscan.devices.projector import DisplayGone, correction, whole_refreshes
 from weldscan.fringes import flat_pattern, fringe_patterns
 from weldscan.response import measured, read_response
@@ -198,6 +199,32 @@ def test_display_gone(screen):
         assert time.monotonic() - start < 6.0
 
 
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_window_killed_or_stuck(screen, number, monkeypatch):
+    """A window that hangs, as it does behind an X server that hangs, ends in a time-out, however often it is asked."""
+    monkeypatch.setattr(window, "SHOW_S", 0.5)
+    projector = backend("projector", "window")
+    with projector(projector.Settings(x=X, width=WIDTH, height=HEIGHT)) as device:
+        device.show(flat_pattern(9, WIDTH, HEIGHT))
+        device._process.send_signal(number)
+        start = time.monotonic()
+        with pytest.raises(DisplayGone if number == signal.SIGKILL else DeviceTimeout):
+            device.show(flat_pattern(9, WIDTH, HEIGHT))
+        with pytest.raises(DisplayGone):
+            for _ in range(3):
+                device.show(flat_pattern(9, WIDTH, HEIGHT))
+        assert time.monotonic() - start < 5.0
+
+
+def test_ctrl_c_is_for_the_scan_and_not_for_its_window(screen):
+    projector = backend("projector", "window")
+    with projector(projector.Settings(x=X, width=WIDTH, height=HEIGHT)) as device:
+        device._process.send_signal(signal.SIGINT)
+        time.sleep(0.1)
+        device.show(flat_pattern(9, WIDTH, HEIGHT))
+    assert device._process.returncode == 0
+
+
 def test_window_outside_of_the_desktop(screen):
     projector = backend("projector", "window")
     with pytest.raises(DisplayGone, match="outside"):
@@ -211,3 +238,12 @@ def test_no_display(monkeypatch):
     projector = backend("projector", "window")
     with pytest.raises(DisplayGone):
         projector(projector.Settings())
+
+
+@pytest.mark.parametrize("driver", window.NO_DISPLAY)
+def test_a_display_that_nobody_can_see_is_none(monkeypatch, driver):
+    pytest.importorskip("pygame", reason="pygame-ce is not installed")
+    monkeypatch.setenv("SDL_VIDEODRIVER", driver)
+    projector = backend("projector", "window")
+    with pytest.raises(DisplayGone, match="no display here"):
+        projector(projector.Settings(width=64, height=40))

@@ -71,7 +71,7 @@ class AravisCamera(Camera):
                 else:
                     camera.gv_auto_packet_size()
             camera.set_acquisition_mode(self._aravis.AcquisitionMode.CONTINUOUS)
-            camera.set_trigger("Software" if settings.trigger == "software" else "Line1")
+            camera.set_trigger("Software" if settings.trigger == "software" else settings.trigger_line)
             self._stream = camera.create_stream(None, None)
             payload = camera.get_payload()
             for _ in range(BUFFERS):
@@ -103,14 +103,9 @@ class AravisCamera(Camera):
         if self.settings.trigger == "software":
             with self._errors("trigger"):
                 self._camera.software_trigger()
-        wait_s = max(deadline_s - time.monotonic(), 0.001)
-        if self.settings.trigger == "software":
-            wait_s = min(wait_s, self.exposure_s + FEATURE_WAIT_S)
-        buffer = self._stream.timeout_pop_buffer(int(wait_s * 1e6))
-        if buffer is None:
-            if time.monotonic() < deadline_s:
-                raise TornFrame(f"{self.name}: no frame after a trigger")
-            raise DeviceTimeout(f"{self.name}: no frame: is it unplugged?")
+        else:
+            self._stream.push_buffer(self._next_buffer(deadline_s))  # it may have begun before the question
+        buffer = self._next_buffer(deadline_s)
         try:
             status = buffer.get_status()
             if status != self._aravis.BufferStatus.SUCCESS:
@@ -123,6 +118,18 @@ class AravisCamera(Camera):
             return data.reshape(height, width).copy()
         finally:
             self._stream.push_buffer(buffer)
+
+    def _next_buffer(self, deadline_s: float) -> Any:
+        wait_s = max(deadline_s - time.monotonic(), 0.001)
+        if self.settings.trigger == "software":
+            wait_s = min(wait_s, self.exposure_s + FEATURE_WAIT_S)
+        buffer = self._stream.timeout_pop_buffer(int(wait_s * 1e6))
+        if buffer is None:
+            if time.monotonic() < deadline_s:
+                raise TornFrame(f"{self.name}: no frame after a trigger")
+            why = "is it unplugged?" if self.settings.trigger == "software" else "does the projector trigger it?"
+            raise DeviceTimeout(f"{self.name}: no frame: {why}")
+        return buffer
 
     def _errors(self, what: str) -> _Errors:
         return _Errors(self.name, what, self._glib.Error)

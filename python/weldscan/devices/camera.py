@@ -36,7 +36,11 @@ class CameraSettings(BaseModel):
     retries: Annotated[int, Field(ge=0, le=100)] = 10
     """Further exposures after a torn frame."""
     trigger: Literal["software", "hardware"] = "software"
-    """hardware: the camera exposes on its trigger input, which the projector drives; a question waits for that."""
+    """hardware: the camera exposes on its trigger input, which the projector drives with every refresh. A question
+    then waits for the second exposure to end: the first may have begun before it.
+    """
+    trigger_line: str = "Line1"
+    """The camera's name of that input."""
     width: Annotated[int, Field(ge=1)] | None = None
     height: Annotated[int, Field(ge=1)] | None = None
     """The size that every frame must have; absent: that of the first frame."""

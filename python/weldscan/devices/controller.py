@@ -253,16 +253,16 @@ class TcpController(StreamController):
                 self._away.clear()
                 self._listener = self._listen(self.port)
             try:
-                peer, address = self._listener.accept()
+                peer, _ = self._listener.accept()
             except TimeoutError:
                 continue
             self._open.add(peer)
-            threading.Thread(target=self._serve, args=(peer, f"{address[0]}:{address[1]}"), daemon=True).start()
+            threading.Thread(target=self._serve, args=(peer,), daemon=True).start()
         self._listener.close()
 
-    def _serve(self, peer: socket.socket, name: str) -> None:
+    def _serve(self, peer: socket.socket) -> None:
         try:
-            self.serve(TcpTransport(peer, name))
+            self.serve(TcpTransport(peer))
         finally:
             self._open.discard(peer)
             peer.close()

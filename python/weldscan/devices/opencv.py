@@ -18,6 +18,7 @@ from pydantic import Field
 from weldscan.devices.camera import Camera, CameraSettings
 from weldscan.errors import DeviceError, DeviceTimeout
 
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what is wrong is told by us, in one line
 V4L2_UNIT_S = 1e-4
 """V4L2 counts exposure in 100 microseconds."""
 AUTO_EXPOSURE_ON, AUTO_EXPOSURE_OFF = 3.0, 1.0

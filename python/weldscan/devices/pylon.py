@@ -61,7 +61,7 @@ class PylonCamera(Camera):
                 self._feature("Width", settings.width)
                 self._feature("Height", settings.height)
             self._feature("TriggerSelector", "FrameStart")
-            self._feature("TriggerSource", "Software" if settings.trigger == "software" else "Line1")
+            self._feature("TriggerSource", "Software" if settings.trigger == "software" else settings.trigger_line)
             self._feature("TriggerMode", "On")
             self.set_exposure(settings.exposure_s)
             self._camera.StartGrabbing(pylon.GrabStrategy_OneByOne)
@@ -99,14 +99,22 @@ class PylonCamera(Camera):
         except self._genicam.GenericException as error:
             raise DeviceError(f"{self.name}: exposure: {_first_line(error)}") from error
 
+    def _retrieve(self, deadline_s: float) -> Any:
+        wait_ms = int(max(deadline_s - time.monotonic(), 0.001) * 1000)
+        return self._camera.RetrieveResult(wait_ms, self._pylon.TimeoutHandling_ThrowException)
+
     def _grab(self, deadline_s: float) -> NDArray[Any]:
+        pylon = self._pylon
         try:
             if self.settings.trigger == "software":
                 wait_ms = int(max(deadline_s - time.monotonic(), 0.001) * 1000)
-                self._camera.WaitForFrameTriggerReady(wait_ms, self._pylon.TimeoutHandling_ThrowException)
+                self._camera.WaitForFrameTriggerReady(wait_ms, pylon.TimeoutHandling_ThrowException)
                 self._camera.ExecuteSoftwareTrigger()
-            wait_ms = int(max(deadline_s - time.monotonic(), 0.001) * 1000)
-            with self._camera.RetrieveResult(wait_ms, self._pylon.TimeoutHandling_ThrowException) as result:
+            else:
+                while (old := self._camera.RetrieveResult(0, pylon.TimeoutHandling_Return)).IsValid():
+                    old.Release()  # nobody asked for these
+                self._retrieve(deadline_s).Release()  # it may have begun before the question
+            with self._retrieve(deadline_s) as result:
                 if not result.GrabSucceeded():
                     raise TornFrame(f"{self.name}: {result.GetErrorDescription()}")
                 image: NDArray[Any] = result.GetArray()

@@ -166,7 +166,7 @@ class RsiController(Controller):
         self.cycle_s, self.sen_type, self.only_send = cycle_s, sen_type, only_send
         self.wrong = self.late = self.cycles = 0
         self.ipoc = 1_343_092
-        self._peer = (host, port)
+        self.port, self._peer = port, (host, port)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((host, 0))
         self._thread = threading.Thread(target=self._run, daemon=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import signal
 import socket
 import struct
 import sys
@@ -40,6 +41,7 @@ def answer(packet: bytes, sen_type: str) -> bytes | None:
 
 def serve(host: str, port: int, controller: str, sen_type: str, only_send: bool, report_port: int) -> None:
     """Answer and report until standard input closes, which it does when the process that wants poses ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which then closes our standard input
     with contextlib.suppress(AttributeError, OSError):  # real-time priority where the system has it and allows it
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REAL_TIME_PRIORITY))
     stream = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -91,8 +91,8 @@ class SerialTransport:
             self._port = serial.serial_for_url(port, baudrate=baud, timeout=0.0, exclusive=None)
             self._port.reset_input_buffer()
         except (OSError, ValueError) as error:
-            raise ConnectionLost(f"{port}: cannot open: {error}") from error
-        self._name = port
+            reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else error
+            raise ConnectionLost(f"cannot open: {reason}") from error
 
     def send(self, data: bytes, deadline_s: float) -> None:
         """Send all of it."""
@@ -100,9 +100,9 @@ class SerialTransport:
             self._port.write_timeout = max(deadline_s - time.monotonic(), 0.001)
             self._port.write(data)
         except serial.SerialTimeoutException as error:
-            raise DeviceTimeout(f"{self._name}: does not take what is sent") from error
+            raise DeviceTimeout("does not take what is sent") from error
         except OSError as error:
-            raise ConnectionLost(f"{self._name}: lost: {error}") from error
+            raise ConnectionLost(f"lost: {error}") from error
 
     def receive(self, deadline_s: float) -> bytes:
         """Wait for at least one byte."""
@@ -113,9 +113,9 @@ class SerialTransport:
                 self._port.timeout = 0.0
                 data += self._port.read(LONGEST_LINE)
         except (OSError, TypeError) as error:  # pyserial: TypeError when the port vanishes in mid-read
-            raise ConnectionLost(f"{self._name}: lost: {error}") from error
+            raise ConnectionLost(f"lost: {error}") from error
         if not data:
-            raise DeviceTimeout(f"{self._name}: no whole answer in time")
+            raise DeviceTimeout("no whole answer in time")
         return data
 
     def close(self) -> None:
@@ -203,7 +203,7 @@ class SerialController(StreamController):
 
     def _run(self) -> None:
         while not self._stop.is_set():  # a fault ends one round of serving, not the terminal
-            self.serve(_Kept(self._near, self.port))
+            self.serve(_Kept(self._near))
 
 
 class _Kept(FileTransport):

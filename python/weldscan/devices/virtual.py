@@ -21,6 +21,7 @@ from weldscan.devices.projector import Projector, ProjectorSettings
 from weldscan.devices.simulated import DEFAULT, Cell, render
 from weldscan.errors import DeviceError, InputError
 from weldscan.fringes import fringe_patterns
+from weldscan.session import explain
 
 _SHOWN: dict[str, NDArray[np.uint8]] = {}
 """The one projector of the one simulated cell of this process."""
@@ -80,14 +81,14 @@ class VirtualCamera(Camera):
         )
         self._robot: Any = None
         if settings.controller:
-            link = settings.controller.get("link")
-            if link not in BACKENDS["robot"]:
+            link = settings.controller.get("link", "kvp")
+            if not isinstance(link, str) or link not in BACKENDS["robot"]:
                 raise InputError(f"camera.controller.link: {link!r} is none of {', '.join(BACKENDS['robot'])}")
             robot = backend("robot", link)
             try:
                 self._robot = robot(robot.Settings.model_validate(settings.controller))
             except ValidationError as error:
-                raise InputError(f"camera.controller: {error.errors()[0]['loc']}: {error.errors()[0]['msg']}") from None
+                raise InputError(f"camera.controller: {explain(error)}") from None
         self._seen: tuple[Any, ...] = ()
         self._rendered: Any = None
         self.set_exposure(settings.exposure_s)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import signal
 import subprocess
 import sys
 import time
@@ -21,6 +22,8 @@ from weldscan.devices.projector import DisplayGone, Projector, ProjectorSettings
 from weldscan.errors import DeviceError, DeviceTimeout
 
 START_S, SHOW_S = 20.0, 5.0
+NO_DISPLAY = ("dummy", "offscreen")
+"""What SDL falls back to where nobody can see anything."""
 
 
 class WindowSettings(ProjectorSettings):
@@ -50,8 +53,9 @@ class WindowProjector(Projector):
             bufsize=0,
             env={**os.environ, "PYGAME_HIDE_SUPPORT_PROMPT": "1"},
         )
+        os.set_blocking(self._process.stdin.fileno(), False)  # type: ignore[union-attr]
         try:
-            self._answer(START_S)
+            self._answer(time.monotonic() + START_S)
         except DeviceError:
             self.close()
             raise
@@ -68,18 +72,31 @@ class WindowProjector(Projector):
             self._process.wait()
 
     def _show(self, image: NDArray[np.uint8]) -> float:
+        give_up_s = time.monotonic() + SHOW_S
         try:
-            self._process.stdin.write(b"S")  # type: ignore[union-attr]
-            view = memoryview(image.tobytes())
-            while view:
-                view = view[self._process.stdin.write(view) :]  # type: ignore[union-attr]
-        except (OSError, ValueError) as error:
-            raise DisplayGone(f"{self.name}: the window is gone") from error
-        self._answer(SHOW_S)
+            self._send(b"S" + image.tobytes(), give_up_s)
+            self._answer(give_up_s)
+        except DeviceError:
+            self._process.kill()  # what it shows from here on is anybody's guess
+            raise
         return time.monotonic()
 
-    def _answer(self, timeout_s: float) -> None:
-        line, give_up_s = b"", time.monotonic() + timeout_s
+    def _send(self, data: bytes, give_up_s: float) -> None:
+        stdin = self._process.stdin
+        assert stdin is not None  # it is a pipe
+        view = memoryview(data)
+        try:
+            while view:
+                if not select.select([], [stdin], [], max(give_up_s - time.monotonic(), 0.0))[1]:
+                    raise DeviceTimeout(f"{self.name}: the window does not take the pattern")
+                view = view[os.write(stdin.fileno(), view) :]
+        except (OSError, ValueError) as error:
+            if isinstance(error, DeviceTimeout):
+                raise
+            raise DisplayGone(f"{self.name}: the window is gone") from error
+
+    def _answer(self, give_up_s: float) -> None:
+        line = b""
         stdout = self._process.stdout
         assert stdout is not None  # it is a pipe
         while not line.endswith(b"\n"):
@@ -95,6 +112,7 @@ class WindowProjector(Projector):
 
 def _serve(x: int, y: int, width: int, height: int) -> None:
     """Show what comes on standard input; say `ok`, or what is wrong, in one line each time."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the scan, which then closes our standard input
     # Descriptor 1 is the answer's alone: whatever a library prints goes to stderr.
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)
@@ -102,6 +120,8 @@ def _serve(x: int, y: int, width: int, height: int) -> None:
         import pygame  # noqa: PLC0415 - an extra, and only this process needs it
 
         pygame.display.init()
+        if (driver := pygame.display.get_driver()) in NO_DISPLAY:
+            raise RuntimeError(f"no display here (video driver {driver})")
         desktop = pygame.display.get_desktop_sizes()
         reach = sum(w for w, _ in desktop), max(h for _, h in desktop)
         if x < 0 or y < 0 or x + width > reach[0] or y + height > max(reach[1], sum(h for _, h in desktop)):

@@ -35,7 +35,7 @@ class ConnectionLost(DeviceError):
 
 
 class Transport(Protocol):
-    """A byte stream. Times are `time.monotonic()` deadlines."""
+    """A byte stream. Times are `time.monotonic()` deadlines; errors name no one, for a `Link` does."""
 
     def send(self, data: bytes, deadline_s: float) -> None:
         """Send all of it."""
@@ -50,20 +50,19 @@ class Transport(Protocol):
 class TcpTransport:
     """A TCP connection."""
 
-    def __init__(self, peer: socket.socket, name: str) -> None:
+    def __init__(self, peer: socket.socket) -> None:
         peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket, self._name = peer, name
+        self._socket = peer
 
     @classmethod
     def connect(cls, host: str, port: int, deadline_s: float) -> TcpTransport:
-        """Open a connection, or say who did not answer."""
-        name = f"{host}:{port}"
+        """Open a connection."""
         try:
-            return cls(socket.create_connection((host, port), _remaining(deadline_s)), name)
+            return cls(socket.create_connection((host, port), _remaining(deadline_s)))
         except (TimeoutError, BlockingIOError) as error:
-            raise DeviceTimeout(f"{name}: no answer to the connection request") from error
+            raise DeviceTimeout("no answer to the connection request") from error
         except OSError as error:
-            raise ConnectionLost(f"{name}: cannot connect: {error.strerror or error}") from error
+            raise ConnectionLost(f"cannot connect: {error.strerror or error}") from error
 
     def send(self, data: bytes, deadline_s: float) -> None:
         """Send all of it."""
@@ -71,9 +70,9 @@ class TcpTransport:
             self._socket.settimeout(_remaining(deadline_s))
             self._socket.sendall(data)
         except (TimeoutError, BlockingIOError) as error:
-            raise DeviceTimeout(f"{self._name}: does not take what is sent") from error
+            raise DeviceTimeout("does not take what is sent") from error
         except OSError as error:
-            raise ConnectionLost(f"{self._name}: connection lost: {error.strerror or error}") from error
+            raise ConnectionLost(f"connection lost: {error.strerror or error}") from error
 
     def receive(self, deadline_s: float) -> bytes:
         """Wait for at least one byte."""
@@ -81,11 +80,11 @@ class TcpTransport:
             self._socket.settimeout(_remaining(deadline_s))
             data = self._socket.recv(LARGEST_MESSAGE)
         except (TimeoutError, BlockingIOError) as error:
-            raise DeviceTimeout(f"{self._name}: no whole answer in time") from error
+            raise DeviceTimeout("no whole answer in time") from error
         except OSError as error:
-            raise ConnectionLost(f"{self._name}: connection lost: {error.strerror or error}") from error
+            raise ConnectionLost(f"connection lost: {error.strerror or error}") from error
         if not data:
-            raise ConnectionLost(f"{self._name}: the other side closed the connection")
+            raise ConnectionLost("the other side closed the connection")
         return data
 
     def close(self) -> None:
@@ -98,28 +97,28 @@ class TcpTransport:
 class FileTransport:
     """A file descriptor that is read and written, such as one end of a pseudo-terminal."""
 
-    def __init__(self, descriptor: int, name: str) -> None:
-        self._fd, self._name = descriptor, name
+    def __init__(self, descriptor: int) -> None:
+        self._fd = descriptor
 
     def send(self, data: bytes, deadline_s: float) -> None:
         """Send all of it."""
         while data:
             if not select.select([], [self._fd], [], _remaining(deadline_s))[1]:
-                raise DeviceTimeout(f"{self._name}: does not take what is sent")
+                raise DeviceTimeout("does not take what is sent")
             data = data[os.write(self._fd, data[:1024]) :]
 
     def receive(self, deadline_s: float) -> bytes:
         """Wait for at least one byte."""
         try:
             if not select.select([self._fd], [], [], _remaining(deadline_s))[0]:
-                raise DeviceTimeout(f"{self._name}: no whole answer in time")
+                raise DeviceTimeout("no whole answer in time")
             data = os.read(self._fd, LARGEST_MESSAGE)
         except (OSError, ValueError) as error:
             if isinstance(error, DeviceTimeout):
                 raise
-            raise ConnectionLost(f"{self._name}: {error}") from error
+            raise ConnectionLost(str(error)) from error
         if not data:
-            raise ConnectionLost(f"{self._name}: closed")
+            raise ConnectionLost("closed")
         return data
 
     def close(self) -> None:

@@ -17,6 +17,8 @@ from weldscan.session import explain
 M = TypeVar("M", bound=BaseModel)
 SELECTOR = {"robot": "link", "camera": "backend", "projector": "backend"}
 """The field of a section that names its backend."""
+DEFAULT = {"robot": "kvp"}
+"""What a section is about that does not say."""
 
 
 class CellConfig(BaseModel):
@@ -36,19 +38,26 @@ class CellConfig(BaseModel):
         """Where it was read from; file names in it are relative to its folder."""
         return self._path
 
-    def open(self, kind: str, **changes: Any) -> Any:
-        """Open the cell's robot, camera or projector, with some of its settings changed."""
-        section = getattr(self, kind)
+    def settings(self, kind: str) -> tuple[Any, BaseModel]:
+        """Return the backend that a section names and its settings; file names in them are relative to the cell's own
+        file.
+        """
+        section, selector = getattr(self, kind), SELECTOR[kind]
         if section is None:
             raise InputError(f"{self.path}: {kind}: missing")
-        selector = SELECTOR[kind]
-        name = section.get(selector)
-        if name not in BACKENDS[kind]:
-            raise InputError(f"{self.path}: {kind}.{selector}: {name!r} is none of {', '.join(BACKENDS[kind])}")
+        name = section.get(selector, DEFAULT.get(kind))
+        if not isinstance(name, str) or name not in BACKENDS[kind]:
+            complaint = "missing; one" if name is None else f"{name!r} is none"
+            raise InputError(f"{self.path}: {kind}.{selector}: {complaint} of {', '.join(BACKENDS[kind])}")
         device = backend(kind, name)
         settings = check(section, device.Settings, f"{self.path}: {kind}")
         here = {name: self.path.parent / value for name, value in settings if isinstance(value, Path)}
-        return device(settings.model_copy(update=here | changes))
+        return device, settings.model_copy(update=here)
+
+    def open(self, kind: str, **changes: Any) -> Any:
+        """Open the cell's robot, camera or projector, with some of its settings changed."""
+        device, settings = self.settings(kind)
+        return device(settings.model_copy(update=changes))
 
     def open_robot(self) -> Robot:
         """Open the robot."""
@@ -60,6 +69,8 @@ def read_cell(path: Path) -> CellConfig:
     """Read `cell.toml`; a wrong field is named in an `InputError`."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; weldscan scan --example-config FOLDER writes a complete one") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from weldscan.devices import BACKENDS, backend
-from weldscan.errors import InputError
+from weldscan.errors import DeviceError, InputError
 from weldscan.pose import KukaPose
 
 if TYPE_CHECKING:
-    from weldscan.devices.controller import Controller
+    from weldscan.devices.controller import Arm, Controller
     from weldscan.devices.robot import Robot, StampedPose
     from weldscan.session import ShotSpec
 
@@ -38,6 +38,7 @@ devices_app = _group("Camera and projector together.")
 
 Config = Annotated[Path, typer.Option("--config", help="The cell's configuration.")]
 CELL = Path("cell.toml")
+MODES = ("#T1", "#T2", "#AUT", "#EX")
 
 
 Tell = Callable[[int, int, str], None]
@@ -104,31 +105,37 @@ def robot_move(
 def robot_simulate(
     link: Annotated[str, typer.Option(help=f"One of {', '.join(BACKENDS['controller'])}.")] = "kvp",
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: a free one (rsi: 64000).")] = 0,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=65535,
+            help="0: a free one. Default: 7000, 54600 or 64000, as the link has it; if taken, a free one.",
+        ),
+    ] = None,
     pose: Annotated[str, typer.Option(help="The flange: X Y Z A B C, mm and degrees.")] = "",
     speed: Annotated[float, typer.Option(min=0.1, help="mm/s")] = 250.0,
+    mode: Annotated[str, typer.Option(help="Operating mode: T1, T2, AUT or EX.")] = "T1",
     fault: Annotated[list[str] | None, typer.Option(help="FAULT or FAULT:COUNT for the next replies.")] = None,
 ) -> None:
     """Be a controller, until Ctrl-C. A line `FAULT [COUNT]` on standard input spoils the next replies.
 
-    It prints one JSON line that says where it listens. Faults: silence, bytes, twice, wrong-id, wrong-length, empty,
-    garbage, huge, dtd, entity, reset, restart, nan, jump, stale.
+    It prints one JSON line that says where it listens; with rsi it sends to that port instead. Faults: silence, bytes,
+    twice, wrong-id, wrong-length, empty, garbage, huge, dtd, entity, reset, restart, nan, jump, stale.
     """
     if link not in BACKENDS["controller"]:
         raise InputError(f"--link: {link!r} is none of {', '.join(BACKENDS['controller'])}")
+    if f"#{mode.upper()}" not in MODES:
+        raise InputError(f"--mode: {mode!r} is none of {', '.join(known.removeprefix('#') for known in MODES)}")
     from weldscan.devices.controller import HOME, Arm
 
-    arm = Arm(_pose(pose.split()) if pose else HOME)
+    arm = Arm(_pose(pose.split()) if pose else HOME, mode=f"#{mode.upper()}")
     arm.speed_mm_s = speed
-    where: dict[str, Any] = {} if link == "serial" else {"host": host, "port": port}
-    if link == "rsi":
-        where["port"] = port or 64000
-    controller: Controller = backend("controller", link)(arm, **where)
-    with controller:
+    with _controller(link, arm, host, port) as controller:
         for request in fault or []:
             _inject(controller, request.replace(":", " "))
-        listening = getattr(controller, "port", where.get("port"))
-        print(json.dumps({"link": link, **({} if link == "serial" else {"host": host}), "port": listening}), flush=True)
+        where = {} if link == "serial" else {"host": host}
+        print(json.dumps({"link": link, **where, "port": controller.port}), flush=True)
         threading.Thread(target=_obey_lines, args=(controller,), daemon=True).start()
         with contextlib.suppress(KeyboardInterrupt):
             threading.Event().wait()
@@ -137,8 +144,6 @@ def robot_simulate(
 @camera_app.command("list")
 def camera_list() -> None:
     """List the cameras that each backend sees."""
-    from weldscan.errors import DeviceError
-
     for name in BACKENDS["camera"]:
         try:
             found = backend("camera", name).available()
@@ -161,7 +166,7 @@ def camera_preview(
     from weldscan.station.cell import read_cell
     from weldscan.station.check import LEAST_CONTRAST, overlay
 
-    done = 0
+    done, out = 0, _in_a_folder(out)
     with read_cell(config).open("camera") as camera, contextlib.suppress(KeyboardInterrupt):
         while count == 0 or done < count:
             frame = camera.capture()
@@ -221,7 +226,7 @@ def devices_check(
     from weldscan.station.cell import read_cell
 
     cell = read_cell(config)
-    out = out if out is not None else config.parent / "response.json"
+    out = _in_a_folder(out if out is not None else config.parent / "response.json")
     with cell.open("projector", response=None) as projector, cell.open("camera") as camera:
         exposure_s = check.prepare(camera, projector)
         print(f"exposure   {exposure_s * 1000:.3f} ms, {exposure_s * projector.settings.refresh_hz:.0f} refreshes")
@@ -236,15 +241,35 @@ def devices_check(
 
 
 def scan(
-    out: Annotated[Path, typer.Option(help="The session folder: new, or with --resume one that was begun.")],
+    out: Annotated[
+        Path | None, typer.Option(help="The session folder: new, or with --resume one that was begun.")
+    ] = None,
     config: Config = CELL,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a scan that was stopped.")] = False,
+    example_config: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Write a complete cell.toml and its plan, all simulated, into a folder; do no more."
+        ),
+    ] = None,
 ) -> None:
-    """Scan what the cell's plan says, into a session folder that `weldscan inspect` reads."""
+    """Scan what the cell's plan says, into a session folder that `weldscan inspect` reads.
+
+    At each pose of the plan: move there, or wait for the operator; wait until the robot stands; take the images between
+    two readings of the pose; look at their quality; keep the shot. What was kept stays, whatever happens next.
+    """
     import signal
 
     from weldscan.station.cell import read_cell
     from weldscan.station.scan import scan as run
+
+    if example_config is not None:
+        from weldscan.station.live import write_example
+
+        print(write_example(example_config))
+        return
+    if out is None:
+        raise InputError("--out: name the session folder")
 
     def stop(_number: int, _frame: object) -> None:
         raise KeyboardInterrupt
@@ -273,10 +298,31 @@ def _ask_the_operator(shot: ShotSpec) -> None:
         raise InputError(f"{shot.name}: nobody is there to say that the robot is at its pose")
 
 
+def _in_a_folder(out: Path) -> Path:
+    """What cannot be written there is told before anything is measured."""
+    if not out.parent.is_dir() or out.is_dir():
+        raise InputError(f"--out: {out}: {'is a folder' if out.is_dir() else f'no such folder: {out.parent}'}")
+    return out
+
+
 def _robot(config: Path) -> Robot:
     from weldscan.station.cell import read_cell
 
     return read_cell(config).open_robot()
+
+
+def _controller(link: str, arm: Arm, host: str, port: int | None) -> Any:
+    """A controller on the wanted port; or on the link's usual one, or where that is taken on any."""
+    kind = backend("controller", link)
+    if link == "serial":
+        return kind(arm)
+    usual = backend("robot", link).Settings.model_fields["port"].default
+    for attempt in (usual, 0) if port is None else (port,):
+        try:
+            return kind(arm, host=host, port=attempt)
+        except OSError as error:
+            complaint = f"{host}:{attempt}: cannot listen: {error.strerror or error}"
+    raise DeviceError(complaint)
 
 
 def _obey_lines(controller: Controller) -> None:

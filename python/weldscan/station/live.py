@@ -1,5 +1,5 @@
 """The whole cell without any hardware: a simulated controller on a real socket, simulated camera and projector, a
-real scan.
+real scan; in one go, or as a configuration to try every command on.
 """
 
 from __future__ import annotations
@@ -12,10 +12,47 @@ from tempfile import TemporaryDirectory
 from weldscan.devices.controller import Arm
 from weldscan.devices.kvp import KvpController
 from weldscan.devices.simulated import DEFAULT, Cell, session_document
-from weldscan.errors import NotMeasured
+from weldscan.errors import InputError, NotMeasured
 from weldscan.pose import KukaPose
 from weldscan.station.cell import CellConfig
 from weldscan.station.scan import scan
+
+EXAMPLE = """\
+# A complete cell, all of it simulated. First its robot, in another terminal:
+#     weldscan robot simulate --link kvp --pose "{pose}"
+# Then, here:
+#     weldscan robot pose --config {cell}
+#     weldscan devices check --config {cell}
+#     weldscan scan --config {cell} --out pipe-1
+#     weldscan inspect pipe-1
+# For a cell of your own, take one section after the other from docs/devices.md. File names are relative to this file.
+name = "example"
+
+[robot]
+link = "kvp"               # KUKAVARPROXY or C3 Bridge; or "eki", "rsi", "serial"
+host = "127.0.0.1"         # the controller
+port = 7000
+allow_motion = true        # here nothing can be hit. In a real cell false, until motion is wanted, in T1
+largest_move_mm = 1000.0   # a target further away is refused
+
+[camera]
+backend = "simulated"      # or "opencv", "aravis", "pylon", "folder"
+exposure_s = 0.03333       # two refreshes of the projector
+
+[camera.controller]        # the simulated camera hangs on the simulated robot, and asks it where that is
+link = "kvp"
+port = 7000
+
+[projector]
+backend = "simulated"      # or "window", "files"
+width = {width}
+height = {height}
+refresh_hz = 60.0
+# response = "response.json"   # as `weldscan devices check` measured it
+
+[scan]
+plan = "plan.json"         # what is to be scanned, with the poses where the flange shall go
+"""
 
 SPEED_MM_S, TURN_SPEED_DEG_S = 5000.0, 1000.0
 """Twenty times T1: nobody stands in this cell."""
@@ -49,3 +86,31 @@ def record_live(
         result = scan(config, folder, tell=tell)
     if result.whole < result.planned:
         raise NotMeasured("; ".join(f"{name}: {reason}" for name, reason in result.rejected))
+
+
+def write_example(folder: Path, cell: Cell = DEFAULT) -> str:
+    """Write `cell.toml` and `plan.json` of a simulated cell into a folder, and return what to do with them.
+
+    Args:
+        folder: made if need be; files of these names that are there already are not touched but refused.
+        cell: what stands where.
+    """
+    plan = session_document(cell)
+    pose = next(shot for shot in plan["shots"] if shot["of"] == "part")["flange_pose"]
+    projector, path = cell.scanner.projector, folder / "cell.toml"
+    text = EXAMPLE.format(
+        pose=" ".join(f"{value:g}" for value in pose.values()),
+        cell=path,
+        width=projector.width,
+        height=projector.height,
+    )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in (("cell.toml", text), ("plan.json", json.dumps(plan, indent=1) + "\n")):
+            with (folder / name).open("x", encoding="utf-8") as file:
+                file.write(content)
+    except FileExistsError as error:
+        raise InputError(f"{error.filename}: exists already; name another folder") from None
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror or error}") from None
+    return "\n".join(line.removeprefix("# ") for line in text.splitlines()[:7])

@@ -93,6 +93,8 @@ def scan(
         InputError: configuration, plan or folder. DeviceError: a device failed; the shots so far are kept.
     """
     settings, plan = read_settings(cell)
+    for kind in ("projector", "camera", *(["robot"] if plan.has_robot else [])):
+        cell.settings(kind)  # a wrong configuration is told before anything is written
     with ShotStore(out, plan, resume) as store, _log_to(out / LOG), ExitStack() as devices:
         log.info("scan of %d shots, %d are there", len(plan.shots), len(store.whole))
         for name, reason in store.redone.items():

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from weldscan import InputError
 from weldscan.fringes import fringe_patterns
-from weldscan.response import read_response
+from weldscan.response import measured, read_response
 from weldscan.station.cli import register
 
 
@@ -78,3 +78,24 @@ def test_devices_check_of_the_simulated_cell(tmp_path, run):
     assert "2 refreshes" in printed
     response = read_response(out).table()
     assert np.abs(response - np.arange(256) / 255).max() < 0.02  # this cell's light is linear
+
+
+def test_devices_check_measures_the_projector_itself(tmp_path, run):
+    """A table that is applied already would make the next one straight."""
+    config = tmp_path / "cell.toml"
+    config.write_text(
+        '[camera]\nbackend = "simulated"\n[projector]\nbackend = "simulated"\nresponse = "response.json"\n'
+    )
+    bent = measured([0, 128, 255], [0.0, 10.0, 200.0])
+    (tmp_path / "response.json").write_text(json.dumps(bent.document()))
+    run("devices", "check", "--config", str(config))
+    assert np.abs(read_response(tmp_path / "response.json").table() - np.arange(256) / 255).max() < 0.02
+
+
+@pytest.mark.parametrize("words", [("devices", "check"), ("camera", "preview")])
+def test_where_nothing_can_be_written(tmp_path, run, words):
+    config = tmp_path / "cell.toml"
+    config.write_text('[camera]\nbackend = "simulated"\n[projector]\nbackend = "simulated"\n')
+    for out in (tmp_path / "nothing" / "there", tmp_path):
+        result = run(*words, "--config", str(config), "--out", str(out), catch_exceptions=True)
+        assert isinstance(result.exception, InputError)

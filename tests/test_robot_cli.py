@@ -10,8 +10,9 @@ import typer
 from typer.testing import CliRunner
 
 from weldscan import DeviceError, InputError
+from weldscan.devices.controller import Arm
 from weldscan.station.cell import read_cell
-from weldscan.station.cli import register
+from weldscan.station.cli import _controller, register
 
 MAIN = (  # a test that runs in the background has Ctrl-C switched off, and its children with it
     "import signal, typer; signal.signal(signal.SIGINT, signal.default_int_handler); "
@@ -84,6 +85,9 @@ def test_pose_watch_move(cell, app):
     [
         ("", "robot: missing"),
         ("[robot]\nlink = 'kuka'", "robot.link"),
+        ("[robot]\nlink = ['kvp']", "robot.link"),
+        ("[robot]\nlink = 'serial'", "robot: port: missing"),
+        ("robot = 'kvp'", "robot: should be an object"),
         ("[robot]\nlink = 'kvp'\nprot = 7000", "prot"),
         ("[robot]\nlink = 'kvp'\ntimeout_s = nan", "timeout_s"),
         ("[robot]\nlink = 'kvp'\nport = 70000", "port"),
@@ -99,8 +103,22 @@ def test_wrong_configuration(tmp_path, text, complaint):
     assert "cell.toml" in str(caught.value)
 
 
+def test_ports_of_simulated_controllers():
+    with _controller("eki", Arm(), "127.0.0.1", None) as first, _controller("eki", Arm(), "127.0.0.1", None) as second:
+        assert first.port != second.port  # the usual one is taken, so it takes another
+        with pytest.raises(DeviceError, match=f"{first.port}: cannot listen"):
+            _controller("eki", Arm(), "127.0.0.1", first.port)
+
+
+@pytest.mark.parametrize(
+    "words", [["--link", "kuka"], ["--mode", "T3"], ["--pose", "1 2"], ["--fault", "flood"], ["--fault", "bytes:x"]]
+)
+def test_wrong_words_to_the_simulator(app, words):
+    assert isinstance(CliRunner().invoke(app, ["robot", "simulate", "--port", "0", *words]).exception, InputError)
+
+
 def test_no_configuration(tmp_path):
-    with pytest.raises(InputError, match=r"cell\.toml"):
+    with pytest.raises(InputError, match=r"cell\.toml: no such file; weldscan scan --example-config"):
         read_cell(tmp_path / "cell.toml")
 
 

@@ -130,6 +130,8 @@ class _Scan:
         self.settings, self.plan, self.store = settings, plan, store
         self.projector, self.camera, self.robot = projector, camera, robot
         self.tell, self.operator = tell, operator
+        self._before: tuple[KukaPose, KukaPose] | None = None
+        """Where the shot before should have been taken, and where it was."""
         lens, size = plan.scanner.projector, (projector.settings.width, projector.settings.height)
         if size != (lens.width, lens.height):
             raise InputError(f"projector: {size[0]}x{size[1]}, but the plan's has {lens.width}x{lens.height} pixels")
@@ -188,6 +190,7 @@ class _Scan:
             if attempt > 0:
                 self._go(shot)
             before = self._standing()
+            self._check_moved(shot, before)
             self._say(f"taking {shot.name}")
             started = time.strftime("%Y-%m-%dT%H:%M:%S%z")
             stacks, whites, actual = [], [], []
@@ -231,6 +234,19 @@ class _Scan:
         s = self.settings
         wait_until_still(self.robot, s.still_window_s, s.still_mm, s.still_deg, s.still_timeout_s)
         return self.robot.pose()
+
+    def _check_moved(self, shot: ShotSpec, pose: StampedPose | None) -> None:
+        """Two shots from one place, though the plan has two: nobody moved the robot, or what it tells is stale."""
+        if pose is None or shot.flange_pose is None:
+            return
+        wanted, there = KukaPose(*shot.flange_pose.model_dump().values()), pose.flange
+        if self._before is not None and not self._same(wanted, self._before[0]) and self._same(there, self._before[1]):
+            raise Rejected("the robot is where it was for the shot before: was it moved, is its pose stale?")
+        self._before = wanted, there
+
+    def _same(self, a: KukaPose, b: KukaPose) -> bool:
+        mm, deg = distance(a, b)
+        return mm <= self.settings.still_mm and deg <= self.settings.still_deg
 
     def _complaint(self, quality: Quality) -> tuple[str | None, float]:
         """What is wrong with a shot, and the exposure that may help."""

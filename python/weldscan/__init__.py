@@ -68,26 +68,44 @@ from weldscan.pose import (
 
 if TYPE_CHECKING:
     from weldscan.calibration.hand_eye import solve_hand_eye
+    from weldscan.calibration.scanner import BoardView, calibrate_scanner, solve_scanner
     from weldscan.inspection import inspect
     from weldscan.norms import judge, limit_mm, norm_ids
     from weldscan.paper_method import paper_step
     from weldscan.report import write_report
     from weldscan.report.validation import write_validation
-    from weldscan.result import Inspection, Label, Validation, Verdict
-    from weldscan.session import Session, iter_frames, read_frames, read_session, write_session
+    from weldscan.result import Inspection, Label, ScannerCalibration, Validation, Verdict
+    from weldscan.session import (
+        Session,
+        iter_frames,
+        read_frames,
+        read_scanner,
+        read_session,
+        write_scanner,
+        write_session,
+    )
     from weldscan.validation import validate
 
 # The faces are imported when they are asked for: they bring pydantic and OpenCV, which an algorithm does not need.
 _LAZY = {
     "weldscan.calibration.hand_eye": ("solve_hand_eye",),
+    "weldscan.calibration.scanner": ("BoardView", "calibrate_scanner", "solve_scanner"),
     "weldscan.inspection": ("inspect",),
     "weldscan.paper_method": ("paper_step",),
     "weldscan.norms": ("judge", "limit_mm", "norm_ids"),
     "weldscan.report": ("write_report",),
     "weldscan.report.validation": ("write_validation",),
-    "weldscan.result": ("Inspection", "Label", "Validation", "Verdict"),
+    "weldscan.result": ("Inspection", "Label", "ScannerCalibration", "Validation", "Verdict"),
     "weldscan.validation": ("validate",),
-    "weldscan.session": ("Session", "iter_frames", "read_frames", "read_session", "write_session"),
+    "weldscan.session": (
+        "Session",
+        "iter_frames",
+        "read_frames",
+        "read_scanner",
+        "read_session",
+        "write_scanner",
+        "write_session",
+    ),
 }
 
 
@@ -100,6 +118,7 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
+    "BoardView",
     "Cloud",
     "Cylinder",
     "CylinderFit",
@@ -123,6 +142,7 @@ __all__ = [
     "Registration",
     "RigidFit",
     "Scanner",
+    "ScannerCalibration",
     "Session",
     "SimulatedShot",
     "Sphere",
@@ -135,6 +155,7 @@ __all__ = [
     "WrappedPhase",
     "__version__",
     "calibrate_reference_plane",
+    "calibrate_scanner",
     "decode",
     "decode_gray",
     "decode_phase",
@@ -163,6 +184,7 @@ __all__ = [
     "parse_frame",
     "place_shots",
     "read_frames",
+    "read_scanner",
     "read_session",
     "register_icp",
     "register_rigid",
@@ -171,12 +193,14 @@ __all__ = [
     "simulate_shot",
     "simulated_step",
     "solve_hand_eye",
+    "solve_scanner",
     "sphere_through_points",
     "triangulate",
     "unwrap_spatial",
     "unwrap_temporal",
     "validate",
     "write_report",
+    "write_scanner",
     "write_session",
     "write_validation",
 ]

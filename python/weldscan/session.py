@@ -27,7 +27,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, 
 
 from weldscan._weldcore import Lens, Scanner, decode_png
 from weldscan.errors import InputError
-from weldscan.result import HandEye
+from weldscan.result import HandEye, ScannerCalibration
 
 Image: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 Frames: TypeAlias = Sequence[Sequence[Image]]
@@ -35,6 +35,7 @@ Frames: TypeAlias = Sequence[Sequence[Image]]
 
 SCHEMA = "weldscan-session/1"
 HAND_EYE_SCHEMA = "weldscan-hand-eye/1"
+SCANNER_SCHEMA = "weldscan-scanner/1"
 
 # How far a matrix of a file may be from a rotation: what six printed decimals leave, and no more.
 ROTATION_TOLERANCE = 1e-5
@@ -102,8 +103,11 @@ def _plain_name(name: str) -> str:
     return name
 
 
-def _covariance(matrix: Matrix) -> Matrix:
-    array = np.asarray(_square(6)(matrix))
+def _covariance(matrix: Matrix, size: int = 6) -> Matrix:
+    array = np.asarray(_square(size)(matrix))
+    # Parameters of different kinds differ by many orders: they are compared as correlations.
+    units = np.sqrt(np.maximum(np.diag(array), 0))
+    array = array / np.outer(units, units) if (units > 0).all() else array
     scale = float(np.abs(array).max())
     if not np.allclose(array, array.T, atol=1e-9 * scale) or np.linalg.eigvalsh(array).min() < -1e-9 * scale:
         raise ValueError("is not a covariance: it should be symmetric and without negative eigenvalues")
@@ -111,6 +115,7 @@ def _covariance(matrix: Matrix) -> Matrix:
 
 
 Rigid = Annotated[Matrix, AfterValidator(_rigid)]
+PlainName = Annotated[str, AfterValidator(_plain_name)]
 Direction = Annotated[Vector, AfterValidator(_non_zero)]
 
 
@@ -130,12 +135,42 @@ class LensSpec(_Model):
     dist: Annotated[tuple[Real, ...], Field(min_length=4, max_length=5)]
 
 
+class CovarianceSpec(_Model):
+    """Of a scanner's parameters: their names, and the matrix in that order."""
+
+    parameters: Annotated[tuple[str, ...], Field(min_length=1, max_length=24)]
+    matrix: Matrix
+
+    @model_validator(mode="after")
+    def _is_one(self) -> Self:
+        _covariance(self.matrix, len(self.parameters))
+        return self
+
+
 class ScannerSpec(_Model):
-    """A calibrated camera-projector pair; the scanner's frame is the camera's."""
+    """A calibrated camera-projector pair; the scanner's frame is the camera's.
+
+    The first three fields are all that a session needs. The others come with `weldscan-scanner/1`, the file that
+    `weldscan calibrate scanner` writes.
+    """
 
     camera: LensSpec
     projector: LensSpec
     camera_from_projector: Rigid
+    schema_: Annotated[Literal["weldscan-scanner/1"] | None, Field(alias="schema")] = None
+    id: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    date: Annotated[str, Field(max_length=100)] | None = None
+    valid_until: Annotated[str, Field(pattern=r"^\d{4}-\d\d-\d\d$")] | None = None
+    board: Annotated[str, Field(max_length=200)] | None = None
+    temperature_c: Annotated[float, Field(ge=-100, le=200)] | None = None
+    covariance: CovarianceSpec | None = None
+    rms_px: dict[str, float] | None = None
+    volume: tuple[dict[str, Any], ...] | None = None
+    """Uncertainty of points, for the record."""
+    poses: tuple[dict[str, Any], ...] | None = None
+    """For the record; nothing reads it."""
+    undetermined: tuple[str, ...] | None = None
+    warnings: tuple[str, ...] | None = None
 
     def build(self) -> Scanner:
         """The core's scanner of these numbers."""
@@ -247,7 +282,7 @@ class FlangePose(_Model):
 class ShotSpec(_Model):
     """One stack of fringe images, in `shots/NAME`."""
 
-    name: Annotated[str, AfterValidator(_plain_name)]
+    name: PlainName
     of: Literal["artefact", "part"]
     flange_pose: FlangePose | None = None
     exposures: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)] | None = None
@@ -292,6 +327,7 @@ class Session(_Model):
     schema_: Literal["weldscan-session/1"] = Field(alias="schema")
     name: Annotated[str, Field(min_length=1, max_length=200)]
     scanner: ScannerSpec
+    """In the file also the name of a `weldscan-scanner/1` document in the session's folder."""
     fringes: Annotated[tuple[FringeSet, ...], Field(min_length=1, max_length=100)]
     artefact: ArtefactSpec | None = None
     hand_eye: HandEyeSpec | Annotated[str, Field(min_length=1, max_length=200)] | None = None
@@ -395,7 +431,7 @@ def read_session(folder: str | os.PathLike[str]) -> Session:
     path = folder / "session.json"
     if not folder.is_dir():
         raise InputError(f"{folder}: {'is not a folder' if folder.exists() else 'no such folder'}")
-    session = _parse(path, Session)
+    session = _parse(path, Session, folder)
     if isinstance(session.hand_eye, str):
         name = session.hand_eye
         inside = (folder / name).resolve()
@@ -408,6 +444,86 @@ def read_session(folder: str | os.PathLike[str]) -> Session:
         raise InputError(f"{path}: scanner: {error}") from None
     session._folder = folder
     return session
+
+
+def read_scanner(path: str | os.PathLike[str]) -> ScannerSpec:
+    """The scanner's calibration that `weldscan calibrate scanner` wrote, checked.
+
+    Raises:
+        InputError: missing, not JSON, or a field is wrong; one line that names file and field.
+    """
+    path = Path(path)
+    spec = _parse(path, ScannerSpec)
+    try:
+        spec.build()
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return spec
+
+
+def write_scanner(path: str | os.PathLike[str], found: ScannerCalibration) -> ScannerSpec:
+    """Keeps a scanner's calibration as `weldscan-scanner/1`; the file appears complete or not at all.
+
+    Returns:
+        The document as read back.
+
+    Raises:
+        InputError: the file cannot be written, or is there already and is no scanner's calibration.
+    """
+    path = Path(path)
+    if path.exists():
+        try:
+            read_scanner(path)
+        except InputError as error:
+            raise InputError(
+                f"{path}: exists and is no scanner's calibration: remove it or name another ({error})"
+            ) from None
+    lenses = {}
+    for device, (width, height) in (("camera", found.camera_size), ("projector", found.projector_size)):
+        k, dist = found.lens(device)
+        lenses[device] = {"width": width, "height": height, "K": k, "dist": dist if dist[4] else dist[:4]}
+    poses = [
+        {
+            "name": pose.name,
+            "camera_from_board": pose.camera_from_board,
+            "features": len(pose.camera_px),
+            "rms_px": {"camera": pose.rms_px[0], "projector": pose.rms_px[1]},
+            "left_out_mm": pose.left_out_mm,
+        }
+        for pose in found.poses
+    ]
+    document = {
+        "schema": SCANNER_SCHEMA,
+        "id": found.id,
+        "date": found.date,
+        "valid_until": found.valid_until,
+        "board": found.board,
+        "temperature_c": found.temperature_c,
+        **lenses,
+        "camera_from_projector": found.camera_from_projector,
+        "covariance": {"parameters": found.parameters, "matrix": found.covariance},
+        "rms_px": dict(zip(("camera", "projector", "both"), found.rms_px, strict=True)),
+        "volume": [
+            {"name": p.name, "point_mm": p.point_mm, "u_mm": p.u_mm, "shape_u_mm": p.shape_u_mm} for p in found.volume
+        ],
+        "poses": poses,
+        "undetermined": found.undetermined,
+        "warnings": found.warnings,
+    }
+    _write_text(path, to_json(plain(document)))
+    return read_scanner(path)
+
+
+def _write_text(path: Path, text: str) -> None:
+    """A file that appears complete or not at all."""
+    partial = path.parent / f".{path.name}.{secrets.token_hex(4)}.partial"
+    try:
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def read_hand_eye(path: str | os.PathLike[str]) -> HandEyeSpec:
@@ -455,34 +571,38 @@ def write_hand_eye(path: str | os.PathLike[str], hand_eye: HandEye) -> HandEyeSp
         **{field.name: getattr(hand_eye, field.name) for field in fields(hand_eye) if field.name != "per_shot"},
         "per_shot": shots,
     }
-    partial = path.parent / f".{path.name}.{secrets.token_hex(4)}.partial"
-    try:
-        partial.write_text(to_json(plain(document)), encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
-    finally:
-        partial.unlink(missing_ok=True)
+    _write_text(path, to_json(plain(document)))
     return read_hand_eye(path)
 
 
 _M = TypeVar("_M", bound=_Model)
 
 
-def _parse(path: Path, model: type[_M]) -> _M:
+def _parse(path: Path, model: type[_M], folder: Path | None = None) -> _M:
+    """A document, checked; in a session's `folder` the scanner may be the name of a file."""
     text = read_text(path)
     try:
-        json.loads(text, object_pairs_hook=_no_duplicates)
+        document = json.loads(text, object_pairs_hook=_no_duplicates)
     except RecursionError:
         raise InputError(f"{path}: is nested too deeply") from None
     except json.JSONDecodeError as error:
         raise InputError(f"{path}: is not JSON: {error.msg} in line {error.lineno}, column {error.colno}") from None
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
+    if folder is not None and isinstance(document, dict) and isinstance(document.get("scanner"), str):
+        text = json.dumps(document | {"scanner": named_scanner(path, document["scanner"])})
     try:
         return model.model_validate_json(text)
     except ValidationError as error:
         raise InputError(f"{path}: {explain(error)}") from None
+
+
+def named_scanner(path: Path, name: str) -> dict[str, Any]:
+    """The scanner's document that a session names: a file in the session's own folder."""
+    inside = (path.parent / name).resolve()
+    if Path(name).is_absolute() or path.parent.resolve() not in inside.parents:
+        raise InputError(f"{path}: scanner: {name!r} is not a file inside the session's folder")
+    return read_scanner(path.parent / name).model_dump(mode="json", by_alias=True, exclude_none=True)
 
 
 def read_text(path: Path) -> str:

@@ -8,9 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from weldscan.result import ScannerCalibration
 
 Tell = Callable[[int, int, str], None]
 Progress = Callable[[], AbstractContextManager[Tell]]
@@ -56,3 +59,72 @@ def hand_eye(
         f"u of a point at the working distance {found.working_point_u_mm:.3f} mm"
     )
     print(f'         kept in {out}; a session carries it as "hand_eye": "{out.name}"')
+
+
+@calibrate.command(
+    "scanner",
+    epilog="Example: weldscan calibrate scanner board-shots --board chessboard:9x13:10mm --out scanner.json",
+)
+def scanner(
+    folder: Annotated[
+        Path,
+        typer.Argument(help="Captures of a board under fringes along both axes: calibration.json and shots/ (docs)."),
+    ],
+    board: Annotated[
+        str | None,
+        typer.Option(
+            help="chessboard:COLSxROWS:SQUAREmm (inner corners), charuco:COLSxROWS:SQUAREmm:MARKERmm (squares), "
+            "circles:COLSxROWS:PITCHmm:DIAMETERmm. Default: what calibration.json says."
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="The file to write; an earlier calibration is replaced.")] = Path(
+        "scanner.json"
+    ),
+    k3: Annotated[bool, typer.Option("--k3", help="Solve for the third radial term of both lenses.")] = False,
+    temperature: Annotated[float | None, typer.Option(help="Of the scanner, °C, for the record.")] = None,
+    valid_days: Annotated[int, typer.Option(min=1, help="After how many days it is out of date.")] = 365,
+) -> None:
+    """Calibrate camera and projector against a flat board, say how good it is, and which pose of the board to add.
+
+    At least three poses, better ten to fifteen: tilted by 30 to 45 degrees to all sides, turned, near and far, so that
+    the board fills the whole image in turn.
+    """
+    from weldscan.calibration.scanner import calibrate_scanner
+    from weldscan.session import read_scanner, write_scanner
+
+    if out.exists():
+        read_scanner(out)
+    with _progress() as progress:
+        found = calibrate_scanner(
+            folder, board, k3=k3, temperature_c=temperature, valid_days=valid_days, progress=progress
+        )
+    write_scanner(out, found)
+    _say(found, out)
+
+
+def _say(found: ScannerCalibration, out: Path) -> None:
+    """A few lines: how good it is, what is missing, where it was kept."""
+    camera, projector, both = found.rms_px
+    print(
+        f"scanner {found.id} from {len(found.poses)} poses: rms {camera:.3f} px camera, {projector:.3f} projector, "
+        f"{both:.3f} both; baseline {found.baseline_mm:.2f} mm"
+    )
+    middle = found.volume[0]
+    worst = max(found.volume, key=lambda p: float(p.shape_u_mm @ p.shape_u_mm))
+    size = [float((p.shape_u_mm @ p.shape_u_mm) ** 0.5) for p in (middle, worst)]
+    print(
+        f"        u of a point (k = 1, shape of the volume): {size[0]:.3f} mm in the middle, "
+        f"{size[1]:.3f} mm {worst.name}"
+    )
+    for name, reason in found.left_out:
+        print(f"        left out {name}: {reason}")
+    for warning in found.warnings:
+        print(f"WARNING {warning}")
+    if found.next_pose is not None:
+        add = found.next_pose
+        x, y, z = add.point_mm
+        print(
+            f"        add next: the board's middle at ({x:.0f}, {y:.0f}, {z:.0f}) mm, tilted by {add.tilt_deg:.0f}° "
+            f"towards {add.around_deg:.0f}°: {add.lowers} from {add.from_value:.3g} to {add.to_value:.3g}"
+        )
+    print(f'        kept in {out}; a session carries it as "scanner": "{out.name}"')

@@ -1,0 +1,343 @@
+"""Captures of a board under fringes along both axes: the folder, its images, and what both devices saw.
+
+A folder has `calibration.json` (`weldscan-calibration/1`, docs/formats.md) or is laid out as SLStudio leaves its
+calibration data. A projector sees no board: its coordinate of a feature is the absolute phase of both axes at the place
+where the camera saw the feature, fitted over the neighbourhood (S. Zhang, P. Huang, Opt. Eng. 45 (2006) 083601).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from weldscan._weldcore import PhaseMap, decode
+from weldscan.calibration.board import Board, Seen
+from weldscan.errors import InputError
+from weldscan.session import FringeSet, Image, Pixels, PlainName, Positive, explain, read_image, read_text
+
+Floats = NDArray[np.float64]
+
+MANIFEST = "calibration.json"
+SCHEMA = "weldscan-calibration/1"
+# A phase that is known worse than this at a feature is no phase: the features themselves are seen ten times better.
+MOST_SIGMA_PX = 0.5
+# Of the neighbourhood's pixels, at least so many must have a phase.
+LEAST_SHARE = 0.3
+
+
+# --- the folder -------------------------------------------------------------------------------------------------------
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True, strict=True, populate_by_name=True)
+
+
+class Size(_Model):
+    """Of an image, pixels."""
+
+    width: Pixels
+    height: Pixels
+
+
+class PoseSpec(_Model):
+    """One pose of the board: a folder of images."""
+
+    name: PlainName
+    folder: Annotated[str, Field(min_length=1, max_length=500)] | None = None
+    """Relative to the calibration's; absent: shots/NAME."""
+    exposures: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)] | None = None
+
+
+class CaptureSpec(_Model):
+    """`calibration.json`: what the images of a calibration are."""
+
+    schema_: Literal["weldscan-calibration/1"] = Field(alias="schema")
+    projector: Size
+    fringes: Annotated[tuple[FringeSet, ...], Field(min_length=2, max_length=100)]
+    board: str | None = None
+    temperature_c: Annotated[float, Field(ge=-100, le=200)] | None = None
+    frames: tuple[str, ...] | None = None
+    """Names of a pose's images in the order of fringes, then of steps; absent: 000.png, 001.png ..."""
+    poses: Annotated[tuple[PoseSpec, ...], Field(min_length=1, max_length=1000)] | None = None
+    """Absent: every folder in shots/, by name."""
+
+
+@dataclass(frozen=True)
+class Captures:
+    """A calibration's folder, checked."""
+
+    folder: Path
+    spec: CaptureSpec
+    poses: tuple[PoseSpec, ...]
+
+    def files(self, pose: PoseSpec) -> list[list[Path]]:
+        """A pose's images: exposures x frames."""
+        count = sum(fringe.steps for fringe in self.spec.fringes)
+        names = self.spec.frames or tuple(f"{i:03d}.png" for i in range(count))
+        exposures = len(pose.exposures or (1.0,))
+        folder = self.folder / (pose.folder or f"shots/{pose.name}")
+        prefixes = [""] if exposures == 1 else [f"e{i}_" for i in range(exposures)]
+        return [[folder / f"{prefix}{name}" for name in names] for prefix in prefixes]
+
+
+def read_captures(folder: str | os.PathLike[str]) -> Captures:
+    """The checked description of a calibration's folder; its images stay on disk.
+
+    Raises:
+        InputError: there is none, or a field of it is wrong; one line that names file and field.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: {'is not a folder' if folder.exists() else 'no such folder'}")
+    path = folder / MANIFEST
+    if not path.is_file():
+        found = _slstudio(folder)
+        if found is None:
+            raise InputError(f"{path}: no such file; docs/formats.md says what it holds")
+        return found
+    try:
+        spec = CaptureSpec.model_validate_json(read_text(path))
+    except ValidationError as error:
+        raise InputError(f"{path}: {explain(error)}") from None
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON: {error}") from None
+    _check(path, spec)
+    poses = spec.poses
+    if poses is None:
+        shots = folder / "shots"
+        names = sorted(p.name for p in shots.iterdir() if p.is_dir() and p.name[0] != ".") if shots.is_dir() else []
+        if not names:
+            raise InputError(f"{shots}: has no folder of images in it")
+        poses = tuple(PoseSpec(name=name) for name in names)
+    for pose in poses:
+        inside = (folder / (pose.folder or f"shots/{pose.name}")).resolve()
+        if folder.resolve() not in inside.parents:
+            raise InputError(f"{path}: poses: {pose.folder!r} is not a folder inside the calibration's")
+    return Captures(folder, spec, poses)
+
+
+def _check(path: Path, spec: CaptureSpec) -> None:
+    axes = {fringe.axis for fringe in spec.fringes}
+    if len(axes) < 2:
+        missing = "y" if "x" in axes else "x"
+        raise InputError(f"{path}: fringes: none along {missing}; a projector needs both axes to be calibrated")
+    seen: set[tuple[str, float]] = set()
+    for index, fringe in enumerate(spec.fringes):
+        side = spec.projector.width if fringe.axis == "x" else spec.projector.height
+        if (fringe.axis, fringe.periods) in seen:
+            raise InputError(f"{path}: fringes.{index}.periods: {fringe.periods:g} is there twice on {fringe.axis}")
+        if 2 * fringe.periods > side:
+            raise InputError(
+                f"{path}: fringes.{index}.periods: {side} projector pixels cannot show {fringe.periods:g} fringes"
+            )
+        seen.add((fringe.axis, fringe.periods))
+    count = sum(fringe.steps for fringe in spec.fringes)
+    if spec.frames is not None and len(spec.frames) != count:
+        raise InputError(f"{path}: frames: {len(spec.frames)} names, but the fringes have {count} images")
+    for name in spec.frames or ():
+        if not re.fullmatch(r"[\w+-][\w .+-]*", name):
+            raise InputError(f"{path}: frames: {name!r} is not the name of a file")
+    names = [pose.name.casefold() for pose in spec.poses or ()]
+    if len(set(names)) < len(names):
+        raise InputError(f"{path}: poses: a name is there twice")
+
+
+def _slstudio(folder: Path) -> Captures | None:
+    """SLStudio's layout: calseqN/frameSeq_00.png ... 11.png, its 2x3 code along x, then y; its file says the size."""
+    names = sorted((p.name for p in folder.glob("calseq*") if p.is_dir()), key=lambda n: (len(n), n))
+    if not names:
+        return None
+    path = folder / "calibration.xml"
+    text = read_text(path)
+    width, height = (re.search(rf"<{tag}>\s*(\d{{1,5}})\s*</{tag}>", text) for tag in ("screenResX", "screenResY"))
+    if width is None or height is None:
+        raise InputError(f"{path}: does not say the projector's size (screenResX, screenResY); a {MANIFEST} can")
+    sets = [{"axis": axis, "periods": periods, "steps": 3} for axis in ("x", "y") for periods in (16.0, 1.0)]
+    spec = CaptureSpec(
+        schema="weldscan-calibration/1",
+        projector=Size(width=int(width[1]), height=int(height[1])),
+        fringes=tuple(FringeSet.model_validate(s) for s in sets),
+        frames=tuple(f"frameSeq_{i:02d}.png" for i in range(12)),
+        poses=tuple(PoseSpec(name=name, folder=name) for name in names),
+    )
+    return Captures(folder, spec, spec.poses or ())
+
+
+# --- the images -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """The images of one pose, decoded."""
+
+    white: NDArray[np.uint8]
+    """The board evenly lit."""
+    columns: PhaseMap
+    rows: PhaseMap
+    size: tuple[int, int]
+
+    def projector(self) -> tuple[Floats, Floats]:
+        """(H, W, 2) projector coordinates, NaN where there is none, and their standard deviations."""
+        maps = self.columns, self.rows
+        return (
+            np.stack([np.asarray(m.column_px) for m in maps], axis=-1),
+            np.stack([np.asarray(m.sigma_px, dtype=np.float64) for m in maps], axis=-1),
+        )
+
+
+def read_stack(captures: Captures, pose: PoseSpec, size: tuple[int, int] | None = None) -> Stack:
+    """Read and decode a pose's images.
+
+    Args:
+        captures: the folder.
+        pose: one of its poses.
+        size: (width, height) that the images must have.
+
+    Raises:
+        InputError: an image is missing, damaged, or not like the rest.
+    """
+    files = captures.files(pose)
+    first = read_image(files[0][0], size)
+    size = first.shape[1], first.shape[0]
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        images = iter(list(pool.map(lambda path: read_image(path, size), [p for row in files for p in row])))
+    exposures = [[next(images) for _ in row] for row in files]
+    for row, paths in zip(exposures, files, strict=True):
+        for image, path in zip(row, paths, strict=True):
+            if image.dtype != first.dtype:
+                raise InputError(f"{path}: is of {image.dtype}, the pose's first image of {first.dtype}")
+    return decode_stack(exposures, captures.spec.fringes, captures.spec.projector, captures.folder / MANIFEST)
+
+
+def decode_stack(
+    exposures: Sequence[Sequence[Image]], fringes: Sequence[FringeSet], projector: Size, where: Path | str = "fringes"
+) -> Stack:
+    """Decode both axes of one pose."""
+    maps = []
+    for axis, side in (("x", projector.width), ("y", projector.height)):
+        frames: list[int] = []
+        at = 0
+        for fringe in fringes:
+            frames += range(at, at + fringe.steps) if fringe.axis == axis else ()
+            at += fringe.steps
+        sets = [(fringe.periods, fringe.steps) for fringe in fringes if fringe.axis == axis]
+        try:
+            maps.append(decode([[row[i] for i in frames] for row in exposures], sets, side))
+        except InputError as error:
+            raise InputError(f"{where}: fringes: axis {axis}: {error}") from None
+    height, width = exposures[0][0].shape
+    return Stack(_white(exposures), maps[0], maps[1], (width, height))
+
+
+def _white(exposures: Sequence[Sequence[Image]]) -> NDArray[np.uint8]:
+    """The mean of a stack is the board evenly lit: the fringes cancel. Of several, the brightest not clipped."""
+    means = [np.mean(np.asarray(row, dtype=np.float32), axis=0) for row in exposures]
+    top = np.iinfo(exposures[0][0].dtype).max
+    # Full swing between black and white is a mean of half of it.
+    whole = [mean for mean in means if np.mean(mean > 0.55 * top) < 0.01] or [min(means, key=lambda m: float(m.mean()))]
+    mean = max(whole, key=lambda m: float(m.mean()))
+    high = float(np.quantile(mean[::4, ::4], 0.995))
+    return np.asarray(np.clip(mean * (250.0 / max(high, 1e-6)), 0, 255), dtype=np.uint8)
+
+
+# --- what the projector saw -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Phases:
+    """The phase field at features."""
+
+    projector_px: Floats
+    """(n, 2), NaN where it is not to be had."""
+    slope: Floats
+    """(n, 2, 2), by the camera's x and y."""
+    sigma_px: Floats
+    """(n,) the larger of the two axes'."""
+
+
+def phases_at(field: Floats, sigma: Floats, pixels: Floats, radius: float) -> Phases:
+    """A quadratic polynomial of each axis' phase around every feature, robust and weighted by 1/sigma².
+
+    Weights begin with those of least absolute deviations and end with Tukey's, so that wrong fringe orders, dirt and
+    what lies beside the board do not count.
+
+    Args:
+        field: (H, W, 2) projector coordinates, NaN where there is none.
+        sigma: (H, W, 2) their standard deviations.
+        pixels: (n, 2) features.
+        radius: of the neighbourhood, px.
+    """
+    n, half = len(pixels), max(2, round(radius))
+    height, width = field.shape[:2]
+    at = np.rint(pixels).astype(int)
+    dy, dx = (v.ravel() for v in np.mgrid[-half : half + 1, -half : half + 1])
+    disc = np.hypot(dx, dy) <= half + 0.5
+    dx, dy = dx[disc], dy[disc]
+    u, v = at[:, :1] + dx, at[:, 1:] + dy
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    u, v = np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
+    x, y = (u - pixels[:, :1]) / half, (v - pixels[:, 1:]) / half
+    basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    values = np.full((n, 2), np.nan)
+    slope = np.zeros((n, 2, 2))
+    worst = np.zeros(n)
+    for axis in (0, 1):
+        value, spread = field[v, u, axis], sigma[v, u, axis]
+        good = inside & np.isfinite(value) & np.isfinite(spread)
+        enough = good.sum(axis=1) >= max(LEAST_SHARE * len(dx), 12)
+        typical = np.where(good, spread, np.nan)
+        typical = np.nanmedian(typical[enough], axis=1) if enough.any() else np.empty(0)
+        some = np.flatnonzero(enough)
+        if not some.size:
+            worst[:] = np.inf
+            continue
+        b, w = basis[some], np.where(good[some], 1 / np.maximum(np.nan_to_num(spread[some], nan=1.0), 1e-3), 0.0)
+        target = np.nan_to_num(value[some])
+        base = np.nanmedian(np.where(good[some], target, np.nan), axis=1)
+        target = target - base[:, None]
+        robust = np.ones_like(target)
+        scale = typical
+        for turn in range(12):
+            weights = np.square(w) * robust
+            normal = np.einsum("nki,nk,nkj->nij", b, weights, b, optimize=True)
+            normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+            right = np.einsum("nki,nk,nk->ni", b, weights, target, optimize=True)
+            fit = np.linalg.solve(normal, right[..., None])[..., 0]
+            whitened = np.abs(target - np.einsum("nki,ni->nk", b, fit)) * w
+            middle = np.nanmedian(np.where(w > 0, whitened, np.nan), axis=1)
+            scale = np.maximum(1.4826 * middle, 1e-6)
+            if turn < 7:
+                robust = 1 / np.maximum(whitened / scale[:, None], 0.1)
+            else:
+                robust = np.square(np.maximum(1 - np.square(whitened / (4.685 * scale[:, None])), 0))
+        used = (robust > 0) & (w > 0)
+        inverse = np.linalg.inv(normal)
+        chi2 = (np.square(whitened) * robust * (w > 0)).sum(axis=1) / np.maximum(robust.sum(axis=1) - 6, 1)
+        own = np.sqrt(np.maximum(inverse[:, 0, 0] * np.maximum(chi2, 1e-12), 0))
+        fits = (used.sum(axis=1) >= max(LEAST_SHARE * len(dx), 12)) & (own < MOST_SIGMA_PX)
+        values[some, axis] = np.where(fits, fit[:, 0] + base, np.nan)
+        slope[some, axis] = fit[:, 1:3] / half
+        worst[some] = np.maximum(worst[some], own)
+        worst[~enough] = np.inf
+    values[np.isnan(values).any(axis=1)] = np.nan
+    return Phases(values, slope, worst)
+
+
+def saturated_share(stack: Stack, seen: Seen, board: Board) -> float:
+    """Share of the pixels around the features that are saturated."""
+    half = max(1, round(0.4 * seen.spacing_px))
+    reason = np.asarray(stack.columns.reason)
+    shares = []
+    for x, y in np.rint(seen.pixels).astype(int):
+        window = reason[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1]
+        shares.append(float(np.mean(window == 2)) if window.size else 0.0)
+    return float(np.mean(shares)) if shares else 0.0

@@ -175,7 +175,7 @@ def test_a_session_that_fails_half_way_leaves_nothing(tmp_path):
         ("shots.1.name", "..", "shots.1.name: '..' cannot name a folder"),
         ("shots.1.name", "a\\b", "shots.1.name: 'a\\\\b' cannot name a folder"),
         ("shots.1.name", "", "shots.1.name: '' cannot name a folder"),
-        ("shots.1.of", "wall", "shots.1.of: should be 'artefact' or 'part', not \"wall\""),
+        ("shots.1.of", "wall", "shots.1.of: should be 'artefact', 'part' or 'plane', not \"wall\""),
         ("shots.1.exposures", [1, 1], "shots.1: exposures: one of them is there twice"),
         ("shots.1.exposures", [1, 0], "shots.1.exposures.1: should be greater than 0, not 0"),
         ("shots", [], "shots: "),

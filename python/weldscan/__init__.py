@@ -74,7 +74,8 @@ if TYPE_CHECKING:
     from weldscan.paper_method import paper_step
     from weldscan.report import write_report
     from weldscan.report.validation import write_validation
-    from weldscan.result import Inspection, Label, ScannerCalibration, Validation, Verdict
+    from weldscan.report.verification import write_verification
+    from weldscan.result import Inspection, Label, ScannerCalibration, Standing, Validation, Verdict, Verification
     from weldscan.session import (
         Session,
         iter_frames,
@@ -85,6 +86,8 @@ if TYPE_CHECKING:
         write_session,
     )
     from weldscan.validation import validate
+    from weldscan.verification import VerificationLimits, flatness_error, probing_error, read_limits, verify
+    from weldscan.verification.history import append_history, read_history, standing_of
 
 # The faces are imported when they are asked for: they bring pydantic and OpenCV, which an algorithm does not need.
 _LAZY = {
@@ -95,7 +98,16 @@ _LAZY = {
     "weldscan.norms": ("judge", "limit_mm", "norm_ids"),
     "weldscan.report": ("write_report",),
     "weldscan.report.validation": ("write_validation",),
-    "weldscan.result": ("Inspection", "Label", "ScannerCalibration", "Validation", "Verdict"),
+    "weldscan.report.verification": ("write_verification",),
+    "weldscan.result": (
+        "Inspection",
+        "Label",
+        "ScannerCalibration",
+        "Standing",
+        "Validation",
+        "Verdict",
+        "Verification",
+    ),
     "weldscan.validation": ("validate",),
     "weldscan.session": (
         "Session",
@@ -106,6 +118,8 @@ _LAZY = {
         "write_scanner",
         "write_session",
     ),
+    "weldscan.verification": ("VerificationLimits", "flatness_error", "probing_error", "read_limits", "verify"),
+    "weldscan.verification.history": ("append_history", "read_history", "standing_of"),
 }
 
 
@@ -147,13 +161,17 @@ __all__ = [
     "SimulatedShot",
     "Sphere",
     "SphereFit",
+    "Standing",
     "Validation",
     "Verdict",
+    "Verification",
+    "VerificationLimits",
     "WeakDirection",
     "WeldShot",
     "WeldscanError",
     "WrappedPhase",
     "__version__",
+    "append_history",
     "calibrate_reference_plane",
     "calibrate_scanner",
     "decode",
@@ -166,6 +184,7 @@ __all__ = [
     "fit_cylinder",
     "fit_plane",
     "fit_sphere",
+    "flatness_error",
     "format_e6axis",
     "format_e6pos",
     "format_frame",
@@ -183,7 +202,10 @@ __all__ = [
     "parse_e6pos",
     "parse_frame",
     "place_shots",
+    "probing_error",
     "read_frames",
+    "read_history",
+    "read_limits",
     "read_scanner",
     "read_session",
     "register_icp",
@@ -195,12 +217,15 @@ __all__ = [
     "solve_hand_eye",
     "solve_scanner",
     "sphere_through_points",
+    "standing_of",
     "triangulate",
     "unwrap_spatial",
     "unwrap_temporal",
     "validate",
+    "verify",
     "write_report",
     "write_scanner",
     "write_session",
     "write_validation",
+    "write_verification",
 ]

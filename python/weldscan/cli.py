@@ -1,4 +1,4 @@
-"""The command line: `weldscan inspect`, `demo`, `validate`; `calibrate` and the live cell bring theirs.
+"""The command line: `weldscan inspect`, `demo`, `validate`, `verify`; `calibrate` and the live cell bring theirs.
 
 Heavy imports happen inside the commands, so that `--help` and a typing error answer at once. What went well goes to
 stdout; progress (a bar on a terminal, JSON lines otherwise) and complaints, each in one line, go to stderr.
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -25,7 +25,7 @@ from weldscan.result import Verdict
 from weldscan.station.cli import register as register_cell
 
 if TYPE_CHECKING:
-    from weldscan.result import Inspection
+    from weldscan.result import Inspection, Verification
 
 EXIT_CODES = {
     Verdict.PASS: 0,
@@ -99,6 +99,20 @@ def inspect(
         list[str] | None,
         typer.Option(help=f"Judge by this norm; may be given several times. Default: {DEFAULT_NORM}.", metavar="ID"),
     ] = None,
+    history: Annotated[
+        Path | None,
+        typer.Option(
+            help="Verifications of the scanner (weldscan verify): the last one must have passed and be valid. Default: "
+            "the session's `verification`, or verification.jsonl in the session or beside it, if there is one."
+        ),
+    ] = None,
+    accept_verification: Annotated[
+        str | None,
+        typer.Option(
+            metavar="REASON",
+            help="Judge although the scanner's verification failed or expired; the report states the reason.",
+        ),
+    ] = None,
 ) -> None:
     """Measure a recorded session and judge it: result.json, report.html, profile.csv, cloud.ply."""
     from weldscan.norms import load_norm
@@ -110,7 +124,7 @@ def inspect(
         load_norm(norm_id)
     out = out if out is not None else Path(f"{session.resolve().name}-report")
     whole_folder.check(out, is_result)
-    found = _inspect_into(session, out, method, norms)
+    found = _inspect_into(session, out, method, norms, history, accept_verification)
     _summary(found, out)
     raise typer.Exit(EXIT_CODES[found.verdict])
 
@@ -175,15 +189,80 @@ def validate(
     print(f"report: {out / 'validation.html'}")
 
 
+@app.command(
+    epilog="Example: weldscan verify plate-and-plane --limits cell.toml --history verification.jsonl    "
+    "limits.toml: pf_mm = 0.15, ps_mm = 0.05, sd_mm = 0.08, f_mm = 0.20, one a line; docs/formats.md has the rest.    "
+    f"{EXITS}"
+)
+def verify(
+    session: SessionFolder,
+    limits: Annotated[
+        Path | None,
+        typer.Option(
+            help="Maximum permissible errors in mm: limits.toml, or cell.toml with a section [verification]. Without "
+            "any, everything is measured, nothing judged and nothing kept."
+        ),
+    ] = None,
+    history: Annotated[
+        Path | None,
+        typer.Option(help="The file that the result is added to. Default: `history` of the limits; else none is kept."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Where verification.json and verification.html go. Default: SESSION's name + '-verification'."
+        ),
+    ] = None,
+    date: Annotated[
+        str | None, typer.Option(help="When the session was recorded, ISO 8601. Default: what its shots say, else now.")
+    ] = None,
+) -> None:
+    """Accept or reverify a scanner: probing error, sphere spacing and flatness (VDI/VDE 2634-2, ISO 10360-13).
+
+    SESSION has shots of the three-sphere plate, of a flat standard ("of": "plane"), or both, at many places of the
+    volume. Each place gives PF, PS and SD, or F; the worst of each is judged against its limit.
+    """
+    from weldscan.report.verification import is_verification, write_verification
+    from weldscan.session import whole_folder
+    from weldscan.verification import read_limits
+    from weldscan.verification import verify as accept
+    from weldscan.verification.history import append_history, check_history, with_drift
+
+    permitted = None if limits is None else read_limits(limits)
+    if history is None and permitted is not None and permitted.history is not None:
+        history = Path(permitted.history)
+    out = out if out is not None else Path(f"{session.resolve().name}-verification")
+    whole_folder.check(out, is_verification)
+    before = None if history is None else check_history(history)
+    with _progress() as progress:
+        found = accept(session, permitted, date=date, progress=progress)
+        if before is not None:
+            found = with_drift(found, before)
+        write_verification(found, out)
+    if history is not None and found.verdict is not Verdict.NOT_ASSESSABLE:
+        append_history(history, found)
+    _told(found, out, history)
+    raise typer.Exit(EXIT_CODES[found.verdict])
+
+
 # --- behind the commands ----------------------------------------------------------------------------------------------
 
 
-def _inspect_into(session: Path, out: Path, method: Method, norms: tuple[str, ...]) -> Inspection:
+def _inspect_into(
+    session: Path,
+    out: Path,
+    method: Method,
+    norms: tuple[str, ...],
+    history: Path | None = None,
+    accept: str | None = None,
+) -> Inspection:
     from weldscan.inspection import inspect as measure
     from weldscan.report import write_report
 
     with _progress() as progress:
-        found: Inspection = measure(session, method=method.value, norms=norms, progress=progress)
+        asked = {"history": history, "accept_verification": accept}
+        given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
+        found: Inspection = measure(session, method=method.value, norms=norms, progress=progress, **given)
         progress(1, 1, "writing the report")
         write_report(found, out)
     return found
@@ -206,11 +285,33 @@ def _summary(found: Inspection, out: Path) -> None:
     for judgement in found.verdicts:
         if judgement is not worst:
             print(f"       {judgement.verdict} by {judgement.norm}, {judgement.clause}: {judgement.reason}")
+    if found.verification is not None:
+        print(f"       scanner: {found.verification.statement}")
     for shot, reason in found.left_out:
         print(f"       left out {shot}: {reason}")
     for warning in found.warnings:
         print(f"       note: {warning}")
     print(f"       report: {out / 'report.html'}")
+
+
+def _told(found: Verification, out: Path, history: Path | None) -> None:
+    """The verdict, a line per characteristic, what was lost, the drift, and where it all went."""
+    colour = COLOURS.get(found.verdict, 36)
+    word = f"\x1b[1;{colour}m{found.verdict}\x1b[0m" if sys.stdout.isatty() else found.verdict
+    print(f"{word}   scanner {found.scanner}, {found.date}, valid until {found.valid_until}")
+    for each in found.characteristics:
+        value = "-" if each.value_mm is None else f"{each.value_mm:+.4f} mm at {each.where}"
+        print(f"       {each.name:2}  {each.verdict:14} {value}, {each.positions} positions: {each.reason}")
+    for shot, reason in found.lost:
+        print(f"       lost {shot}: {reason}")
+    for drift in found.drift:
+        print(f"       drift of {drift.name}: {drift.text}")
+    for note in (*found.assumed, *found.notes, *found.warnings):
+        print(f"       note: {note}")
+    if history is not None:
+        judged = found.verdict is not Verdict.NOT_ASSESSABLE
+        print(f"       history: {history}" if judged else f"       nothing was judged, so {history} was left as it is")
+    print(f"       report: {out / 'verification.html'}")
 
 
 def _is_demo(folder: Path) -> bool:

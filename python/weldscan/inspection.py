@@ -30,6 +30,7 @@ from weldscan.paper_method import paper_step
 from weldscan.points import PointReader, Progress
 from weldscan.result import BudgetLine, HandEye, Histogram, Inspection, PartCloud, StepResult
 from weldscan.session import PartSpec, ShotSpec, read_session
+from weldscan.verification.history import standing_of
 
 Floats = NDArray[np.float64]
 DEFAULT_NORMS = ("pnae-g-7-010-89",)
@@ -43,6 +44,8 @@ def inspect(
     *,
     method: str = "surface",
     norms: Sequence[str] = DEFAULT_NORMS,
+    history: str | os.PathLike[str] | None = None,
+    accept_verification: str | None = None,
     progress: Progress | None = None,
 ) -> Inspection:
     """The step of a weld with its uncertainty and verdicts, from a session folder.
@@ -51,6 +54,9 @@ def inspect(
         folder: a `weldscan-session/1` folder (docs/formats.md).
         method: which number is judged: `surface` (the largest step around the seam) or `paper` (the paper's histogram).
         norms: ids as `weldscan.norms.norm_ids()` lists them.
+        history: of the scanner's verifications; by default the one that the session names or has beside it. Where
+            there is one, the last verification of this scanner must have passed and be valid, else nothing is judged.
+        accept_verification: the reason for which the scanner is relied on whatever its history says.
         progress: called with (done, total, what) while it works.
 
     Returns:
@@ -69,7 +75,7 @@ def inspect(
         >>> abs(result.step.max_abs_mm - abs(truth["step_mm"]["max_abs"])) < result.step.expanded_uncertainty_mm
         True
     """
-    run = _Run(folder, method, norms, progress)
+    run = _Run(folder, method, norms, progress, history, accept_verification)
     # 1-4  the three-sphere plate in every artefact shot: where the scanner sits on the flange
     hand_eye = hand_eye_of(run.read, run.left_out)
     # 5-6  every part shot: its points, its place in base, reference wall, other wall and bead
@@ -95,7 +101,13 @@ class _Run:
     """One inspection under way: the session, and what went wrong."""
 
     def __init__(
-        self, folder: str | os.PathLike[str], method: str, norms: Sequence[str], progress: Progress | None
+        self,
+        folder: str | os.PathLike[str],
+        method: str,
+        norms: Sequence[str],
+        progress: Progress | None,
+        history: str | os.PathLike[str] | None,
+        accept_verification: str | None,
     ) -> None:
         if method not in METHODS:
             raise InputError(f"method: must be one of {', '.join(METHODS)}, got {method!r}")
@@ -106,6 +118,7 @@ class _Run:
             raise InputError(f"{self.session.folder / 'session.json'}: shots: none is of the part")
         self.part: PartSpec = self.session.part
         self.method, self.norms = method, tuple(norms)
+        self.standing = standing_of(self.session, history, accept_verification)
         self.read = PointReader(self.session, progress)
         self.left_out: list[tuple[str, str]] = list(left_out_of(self.session.folder))
         unusable = {name for name, _ in self.left_out}
@@ -186,7 +199,11 @@ class _Run:
                 value = None if step.histogram is None else step.histogram.step_mm
                 expanded = self.paper_uncertainty_mm(step, cloud, hand_eye)
         part = self.part.model_dump()
+        if not self.standing.relied_on:
+            value, expanded = None, None
         reason = "; ".join(f"{name}: {why}" for name, why in self.left_out) or "method paper gave no answer"
+        if not self.standing.relied_on:
+            reason = f"the scanner is not verified: {self.standing.text}"
         verdicts = [
             verdict
             for norm in self.norms
@@ -214,6 +231,7 @@ class _Run:
                 "numpy": np.__version__,
                 "session_sha256": self.session.sha256,
             },
+            verification=self.standing,
         )
 
     def paper_uncertainty_mm(self, step: StepResult, cloud: PartCloud | None, hand_eye: HandEye | None) -> float | None:

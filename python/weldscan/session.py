@@ -44,6 +44,8 @@ PARALLEL_SINE = 1e-3
 # More pixels than any camera has: a typing error, or an attempt to exhaust the memory.
 MAX_SIDE_PX = 65_535
 MAX_JSON_BYTES = 16 * 1024 * 1024
+# How far a calibrated distance may be from the touched one, beyond half a per cent: far more than a probe reads wrong.
+CALIBRATION_MISFIT_MM = 0.2
 
 
 # --- what the fields are made of --------------------------------------------------------------------------------------
@@ -204,9 +206,21 @@ class ArtefactSpec(_Model):
     """Standard uncertainty of a touched centre, each coordinate, its own (k = 1)."""
     touch_bias_sigma_mm: Positive | None = None
     """And common to all three."""
+    sphere_diameter_u: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Expanded uncertainty (k = 2) of the diameter, as the certificate has it."""
+    sphere_form: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Largest departure of the spheres from their form, as the certificate has it."""
+    distances: tuple[Positive, Positive, Positive] | None = None
+    """Calibrated distances of the centres 1-2, 2-3, 3-1; without them those between the touched centres count."""
+    distances_u: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Expanded uncertainty (k = 2) of a calibrated distance."""
 
     @model_validator(mode="after")
     def _is_a_triangle(self) -> Self:
+        if self.distances_u is not None and self.distances is None:
+            raise ValueError("distances_u: given without distances")
+        if self.distances is not None and 2 * max(self.distances) >= sum(self.distances):
+            raise ValueError("distances: no three centres are so far apart")
         if self.centres_base is None:
             return self
         centres = np.asarray(self.centres_base)
@@ -220,7 +234,23 @@ class ArtefactSpec(_Model):
         sides = centres[1] - centres[0], centres[2] - centres[0]
         if np.linalg.norm(np.cross(*sides)) < PARALLEL_SINE * np.linalg.norm(sides[0]) * np.linalg.norm(sides[1]):
             raise ValueError("centres_base: the three centres lie on one line, which fixes no rotation about it")
+        for index, ((i, j), stated) in enumerate(zip(((0, 1), (1, 2), (2, 0)), self.distances or (), strict=False)):
+            touched = float(np.linalg.norm(centres[i] - centres[j]))
+            if abs(stated - touched) > CALIBRATION_MISFIT_MM + 0.005 * stated:
+                raise ValueError(
+                    f"distances.{index}: {stated:g} mm between spheres {i + 1} and {j + 1}, "
+                    f"but centres_base are {touched:.3f} mm apart"
+                )
         return self
+
+
+class PlaneSpec(_Model):
+    """The flat standard that the `plane` shots show, for `weldscan verify`."""
+
+    size: tuple[Positive, Positive] | None = None
+    """Its sides, the longer one first or last."""
+    flatness: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Its departure from a plane, as the certificate has it."""
 
 
 class PartSpec(_Model):
@@ -283,7 +313,7 @@ class ShotSpec(_Model):
     """One stack of fringe images, in `shots/NAME`."""
 
     name: PlainName
-    of: Literal["artefact", "part"]
+    of: Literal["artefact", "part", "plane"]
     flange_pose: FlangePose | None = None
     exposures: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)] | None = None
     """Relative exposure of each stack; absent: one stack."""
@@ -332,8 +362,12 @@ class Session(_Model):
     artefact: ArtefactSpec | None = None
     hand_eye: HandEyeSpec | Annotated[str, Field(min_length=1, max_length=200)] | None = None
     """The document itself, or the name of its file in the session's folder (`read_session` puts the document here)."""
+    plane: PlaneSpec | None = None
+    """The flat standard of the `plane` shots; those may do without it."""
     part: PartSpec | None = None
     robot: RobotSpec | None = None
+    verification: Annotated[str, Field(min_length=1, max_length=1000)] | None = None
+    """The history file of the scanner's verifications, relative to the session's folder."""
     shots: Annotated[tuple[ShotSpec, ...], Field(min_length=1, max_length=10_000)]
     _folder: Path | None = PrivateAttr(default=None)
 
@@ -353,6 +387,11 @@ class Session(_Model):
     def artefact_shots(self) -> tuple[ShotSpec, ...]:
         """The shots of the three-sphere plate."""
         return tuple(shot for shot in self.shots if shot.of == "artefact")
+
+    @property
+    def plane_shots(self) -> tuple[ShotSpec, ...]:
+        """The shots of the flat standard."""
+        return tuple(shot for shot in self.shots if shot.of == "plane")
 
     @property
     def part_shots(self) -> tuple[ShotSpec, ...]:
@@ -402,12 +441,13 @@ class Session(_Model):
                 yield "part.axis_base: missing; only a session without a robot may leave it out"
             if self.hand_eye is not None and self.artefact_shots:
                 yield "hand_eye: given together with artefact shots; leave one of them out"
-            if self.hand_eye is None and not self.artefact_shots:
+            if self.hand_eye is None and self.part_shots and not self.artefact_shots:
                 yield "hand_eye: missing, and there are no artefact shots to find it from"
             return
         if self.hand_eye is not None:
             yield "hand_eye: given, but the shots have no flange_pose to use it with"
-        if self.artefact_shots or len(self.part_shots) != 1:
+        if self.part_shots and len(self.shots) > 1:
+            # Artefact and plane alone need no robot: that is a verification of the scanner.
             yield (
                 "shots.0.flange_pose: missing; only a session with exactly one shot, and that of the part, "
                 "can do without a robot"

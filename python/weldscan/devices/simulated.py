@@ -29,6 +29,8 @@ Progress: TypeAlias = Callable[[int, int, str], None]
 
 # Labels of the truth. A weld's parts follow on its label: reference wall, other wall, bead.
 REFERENCE_WALL, OTHER_WALL, BEAD, PLATE, STEM, SPHERE = 1, 2, 3, 4, 5, 6
+Target: TypeAlias = Literal["artefact", "part", "plane"]
+"""What a shot is of."""
 # Profile bins as in `weldscan-result/1`: 2 degrees, centred on even degrees.
 BIN_DEG = 2
 BIN_MM = 0.005
@@ -313,6 +315,11 @@ class Cell:
     base_from_plate: Matrix | Floats = _PLATE
     artefact_shots: int = 6
 
+    # The flat standard: its shots belong to a verification of the scanner.
+    flat_mm: tuple[float, float, float] = (150.0, 110.0, 12.0)
+    base_from_flat: Matrix | Floats = _PLATE
+    plane_shots: int = 0
+
     # The robot. A cell without one has one part shot and no artefact.
     robot: str | None = "KUKA KR10 R1100"
     flange_from_scanner: Matrix | Floats = _HAND_EYE
@@ -347,6 +354,10 @@ class Cell:
                 bodies.append(Body(Sphere(self.sphere_diameter_mm / 2), plate @ placed(centre), CERAMIC, SPHERE + i))
         return bodies
 
+    def plane_bodies(self) -> list[Body]:
+        """Return the flat standard."""
+        return [Body(Block(self.flat_mm), np.asarray(self.base_from_flat), CERAMIC, PLATE)]
+
     def part_bodies(self) -> list[Body]:
         """Return the weld."""
         return [Body(self.weld, np.asarray(self.base_from_weld), self.part_surface, REFERENCE_WALL)]
@@ -357,6 +368,11 @@ class Cell:
         return tilted_views(
             np.asarray(self.base_from_plate) @ target, self.artefact_shots, distance_mm=self.distance_mm
         )
+
+    def plane_views(self) -> list[Floats]:
+        """Return base_from_scanner per shot of the flat standard, placed as those of the artefact."""
+        top = placed((0.0, 0.0, self.flat_mm[2] / 2))
+        return tilted_views(np.asarray(self.base_from_flat) @ top, self.plane_shots, distance_mm=self.distance_mm)
 
     def part_views(self) -> list[Floats]:
         """Return base_from_scanner per part shot: nearly square to the surface, the image's x along the axis."""
@@ -386,19 +402,20 @@ DEFAULT = Cell()
 @dataclass(frozen=True)
 class _Shot:
     name: str
-    of: Literal["artefact", "part"]
+    of: Target
     base_from_scanner: Floats
     exposures: tuple[float, ...]
     seed: int
 
 
 def _plan(cell: Cell) -> list[_Shot]:
-    views: list[tuple[Literal["artefact", "part"], Floats]] = [("artefact", v) for v in cell.artefact_views()]
+    views: list[tuple[Target, Floats]] = [("artefact", v) for v in cell.artefact_views()]
     views += [("part", v) for v in cell.part_views()]
+    views += [("plane", v) for v in cell.plane_views()]
     if cell.robot is None and [of for of, _ in views] != ["part"]:
         raise InputError("cell: without a robot there is one part shot and no artefact shot")
     seeds = np.random.SeedSequence(cell.seed).generate_state(len(views), np.uint64)
-    numbers = {"artefact": 0, "part": 0}
+    numbers = {"artefact": 0, "part": 0, "plane": 0}
     shots = []
     for (of, view), seed in zip(views, seeds, strict=True):
         numbers[of] += 1
@@ -407,9 +424,9 @@ def _plan(cell: Cell) -> list[_Shot]:
     return shots
 
 
-def render(cell: Cell, of: Literal["artefact", "part"], base_from_scanner: Floats, **options: Any) -> SimulatedShot:
-    """Return one shot of the cell's artefact or part; options are those of `simulate_shot` (exposures, seed)."""
-    bodies = cell.part_bodies() if of == "part" else cell.artefact_bodies()
+def render(cell: Cell, of: Target, base_from_scanner: Floats, **options: Any) -> SimulatedShot:
+    """Return one shot of artefact, part or flat standard; options are those of `simulate_shot` (exposures, seed)."""
+    bodies = {"part": cell.part_bodies, "artefact": cell.artefact_bodies, "plane": cell.plane_bodies}[of]()
     return simulate_shot(cell.scanner, base_from_scanner, bodies, cell.fringes, cell.photometry, **options)
 
 
@@ -463,6 +480,8 @@ def _document(cell: Cell, shots: Sequence[_Shot], random: np.random.Generator) -
             "sphere_diameter": cell.sphere_diameter_mm,
             "centres_base": touched.round(4).tolist(),
         }
+    if cell.plane_shots:
+        document["plane"] = {"size": list(cell.flat_mm[:2]), "flatness": 0.0}
     return document
 
 
@@ -546,7 +565,8 @@ def simulate_session(
                     surface.append(_moved(shot.base_from_scanner, some))
             whites[shot.name] = rendered.white
             yield shot.name, rendered.frames
-        step = _step_of(cell, *(np.concatenate(values) for values in zip(*pooled, strict=True)))
+        deviations, alongs = ([pair[i] for pair in pooled] or [np.zeros(0)] for i in (0, 1))
+        step = _step_of(cell, np.concatenate(deviations), np.concatenate(alongs))
         truth["step_mm"] = step
         if surface and cell.robot is not None and cell.touched_points:
             probed = np.concatenate(surface)[: cell.touched_points]

@@ -115,6 +115,7 @@ def result_document(inspection: Inspection, created: datetime) -> dict[str, Any]
         "hand_eye": _hand_eye(hand_eye),
         "counts": counts(inspection.cloud),
         "verdicts": [_judgement(judgement) for judgement in inspection.verdicts],
+        "verification": None if inspection.verification is None else vars(inspection.verification),
         "left_out": [{"shot": shot, "reason": reason} for shot, reason in inspection.left_out],
         "warnings": list(inspection.warnings),
         "masks": inspection.masks,
@@ -386,12 +387,21 @@ def _masks(masks: Mapping[str, Mapping[str, int]]) -> list[tuple[str, list[str],
     return rows
 
 
+def _standing(inspection: Inspection) -> str:
+    standing = inspection.verification
+    if standing is None:
+        return "no verification on record"
+    held = "".join(f"; {what} {value}" for what, value in (("history", standing.history), ("id", standing.id)) if value)
+    return standing.statement + held
+
+
 def _record(inspection: Inspection) -> list[tuple[str, str]]:
     part = [(f"part: {name}", str(value)) for name, value in inspection.part.items() if value is not None]
     timing = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in inspection.timing_s.items())
     return [
         ("method judged", inspection.method),
         ("frame of the cloud", inspection.frame),
+        ("verification of the scanner", _standing(inspection)),
         *part,
         ("time", timing),
         *((name.replace("_", " "), value) for name, value in inspection.software.items()),

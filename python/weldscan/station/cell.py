@@ -31,6 +31,8 @@ class CellConfig(BaseModel):
     camera: dict[str, Any] | None = None
     projector: dict[str, Any] | None = None
     scan: dict[str, Any] = {}
+    verification: dict[str, Any] | None = None
+    """The limits of `weldscan verify`, which checks them."""
     _path: Path = Path("cell.toml")
 
     @property

@@ -320,7 +320,7 @@ def _characteristics(
         spacing_u = certified(artefact.distances_u, spacing_u, "artefact.distances_u (k = 2)", bool(spacings))
     elif spacings:
         assumed.append(
-            "artefact.distances are not in the session: SD is held against the distances touched with the robot's probe, "
+            "artefact.distances are not in the session: SD is held against the distances that the probe touched, "
             f"U = {spacing_u:.3f} mm (k = 2), which are no calibration"
         )
     on_balls = [f"{n}: {why}" for n, why in lost.items() if kinds.get(n, "artefact") == "artefact"]

@@ -23,7 +23,8 @@ $(VENV)/.built-$(PROFILE): $(VENV)/.tools $(RUST) pyproject.toml
 	@VIRTUAL_ENV=$(abspath $(VENV)) $(BIN)/maturin develop --quiet --locked --profile $(PROFILE)
 	@rm -f $(VENV)/.built-* && touch $@
 
-$(VENV)/.peers: requirements-peers.txt $(VENV)/.tools
+$(VENV)/.peers: requirements-peers.txt .ci/debian-peers $(VENV)/.tools
+	@.ci/debian-peers
 	@while read -r peer; do case "$$peer" in ""|\#*) continue;; esac; \
 	  $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps "$$peer" 2>/dev/null \
 	    || echo "without $$peer: its tests are skipped"; done < requirements-peers.txt

@@ -13,10 +13,11 @@ from weldscan import DeviceError, DeviceTimeout, KukaPose
 from weldscan.devices.controller import Arm, Fault
 from weldscan.devices.eki import EkiController, EkiRobot, EkiSettings
 from weldscan.devices.kinematics import ArmGeometry
-from weldscan.devices.kvp import KvpController, KvpRobot, KvpSettings
+from weldscan.devices.kvp import READ, KvpController, KvpRobot, KvpSettings, encode_request
 from weldscan.devices.robot import distance, wait_until_still
 from weldscan.devices.rsi import RsiController, RsiRobot, RsiSettings
-from weldscan.devices.serial import SerialController, SerialRobot, SerialSettings
+from weldscan.devices.serial import SerialController, SerialRobot, SerialSettings, cut_line
+from weldscan.devices.wire import ConnectionLost, Link
 
 TIMEOUT_S = 0.6
 LATE_S = 0.7
@@ -382,6 +383,71 @@ def test_rsi_listens_to_its_controller_alone(arm):
     robot = RsiRobot(RsiSettings(port=0, timeout_s=0.3, controller="127.0.0.9"))
     with robot, RsiController(arm, port=robot.port), pytest.raises(DeviceTimeout):
         robot.pose()
+
+
+def test_reset_is_a_reset():
+    """Not an orderly end: what the client's socket says is ECONNRESET."""
+    with KvpController(Arm(FLANGE)) as controller:
+        controller.inject(Fault.RESET)
+        with socket.create_connection(("127.0.0.1", controller.port), 2.0) as peer:
+            peer.sendall(encode_request(1, READ, ["$POS_ACT"]))
+            with pytest.raises(ConnectionResetError):
+                while peer.recv(4096):
+                    pass
+
+
+@pytest.mark.parametrize(
+    ("length", "content"),
+    [
+        ("longer than what comes", b"\x00\x01\xff\xff\x00\x00\x03#T1\x00\x01\x01"),
+        ("shorter than what comes", b"\x00\x01\x00\x05\x00\x00\x03#T1\x00\x01\x01"),
+        ("of nothing", b"\x00\x01\x00\x00"),
+        ("of half a head", b"\x00\x01\x00"),
+        ("right, the value's too long", b"\x00\x01\x00\x09\x00\x00\xff#T1\x00\x01\x01"),
+        ("right, the value's too short", b"\x00\x01\x00\x09\x00\x00\x02#T1\x00\x01\x01"),
+    ],
+)
+def test_lengths_that_lie(length, content):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve():
+            peer, _ = server.accept()
+            with peer:
+                peer.recv(100)
+                peer.sendall(content)
+                peer.recv(100)  # until the client hangs up
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        robot = KvpRobot(KvpSettings(port=server.getsockname()[1], timeout_s=0.3))
+        start = time.monotonic()
+        with robot, pytest.raises(DeviceError):
+            robot.get("$MODE_OP")
+        assert time.monotonic() - start < 0.3 + LATE_S, length
+        thread.join(5.0)
+        assert not thread.is_alive()
+
+
+def test_back_off():
+    """A controller that is away is asked again with growing pauses, and given up when the time is over."""
+    tried_s = []
+
+    def connect(_deadline_s):
+        tried_s.append(time.monotonic())
+        raise ConnectionLost("nobody there")
+
+    link = Link("link", connect, cut_line, 0.1, 2.0)
+    start = time.monotonic()
+    with pytest.raises(ConnectionLost, match="link: nobody there"):
+        link.ask(b"?", lambda message: message)
+    assert time.monotonic() - start < 2.0 + LATE_S
+    pauses = np.diff(tried_s)
+    assert pauses[:4] == pytest.approx([0.05, 0.1, 0.2, 0.4], abs=0.1)
+    assert (np.diff(pauses[:4]) > 0).all()
+    tried_s.clear()
+    with pytest.raises(ConnectionLost):
+        link.ask(b"move!", lambda message: message, repeat=False)
+    assert len(tried_s) == 1  # what may have had an effect is not said twice
 
 
 @pytest.mark.parametrize("link", ["kvp", "eki"])

@@ -52,6 +52,23 @@ def test_unknown_variable_as_either_program_says_it():
         kvp.decode_reply(empty + bytes.fromhex("00 00 00"), 1, kvp.READ)
 
 
+def test_kvp_no_byte_of_a_reply_may_be_another():
+    """Whatever stands around the value decides whether it is the answer; only the 16-bit error field says nothing."""
+    reply = kvp.encode_reply(7, kvp.READ, ["{FRAME: X 1.0}"])
+    ignored = {len(reply) - 3, len(reply) - 2}
+    for place in [*range(7), *range(len(reply) - 3, len(reply))]:
+        for byte in range(256):
+            changed = reply[:place] + bytes([byte]) + reply[place + 1 :]
+            if changed == reply or place in ignored:
+                assert kvp.decode_reply(changed, 7, kvp.READ) == ["{FRAME: X 1.0}"]
+                continue
+            with pytest.raises(DeviceError):
+                kvp.decode_reply(changed, 7, kvp.READ)
+    for end in range(len(reply)):
+        with pytest.raises(DeviceError):
+            kvp.decode_reply(reply[:end], 7, kvp.READ)
+
+
 def samples():
     """Pairs of request and reply."""
     lines = shared("robot/c3_frames.txt").read_text().splitlines()

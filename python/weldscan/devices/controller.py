@@ -75,6 +75,8 @@ class Arm:
     ) -> None:
         self.tool, self.base, self.mode, self.interpolation = tool, base, mode, "#BASE"
         self._geometry, self._joints = ArmGeometry(), HOME_JOINTS
+        self._held: KukaPose | None = None
+        """The flange that these joints hold."""
         self.speed_mm_s, self.turn_speed_deg_s = T1_SPEED_MM_S, TURN_SPEED_DEG_S
         self._start_s, self._seconds = time.monotonic(), 0.0
         self._frozen: KukaPose | None = None
@@ -99,7 +101,10 @@ class Arm:
     @property
     def joints_deg(self) -> Joints:
         """A1 to A6 now: of the ways to hold the flange the one nearest to where the joints were."""
-        self._joints = self._geometry.joints(self.flange().matrix(), self._joints) or self._joints
+        flange = self.flange()
+        if flange != self._held:
+            self._joints = self._geometry.joints(flange.matrix(), self._joints) or self._joints
+            self._held = flange
         return self._joints
 
     def move(self, target: KukaPose) -> None:
@@ -115,7 +120,7 @@ class Arm:
     def move_joints(self, joints_deg: Joints) -> None:
         """Set off for a pose that is given by its joints."""
         self.move(KukaPose.from_matrix(self._geometry.flange(joints_deg)))
-        self._joints = joints_deg
+        self._joints, self._held = joints_deg, None
 
     def place(self, target: KukaPose) -> None:
         """Be at a pose at once, as when an operator has jogged the arm there; for a far one the arm is a larger one."""
@@ -270,7 +275,9 @@ class TcpController(StreamController):
     def _break(self, transport: Transport, fault: Fault) -> None:
         if fault is Fault.RESTART:
             self._away.set()
-        super()._break(transport, fault)
+            super()._break(transport, fault)
+        elif isinstance(transport, TcpTransport):
+            transport.reset()
 
     def _hang_up(self) -> None:
         for peer in list(self._open):

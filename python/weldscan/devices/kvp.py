@@ -114,7 +114,7 @@ def decode_reply(frame: bytes, number: int, function: int, count: int = 1) -> li
     if len(rest) != 3:
         raise DeviceError(f"the reply's length does not fit its content: {frame[:40]!r}")
     error, ok = struct.unpack(">HB", rest)
-    if not ok:
+    if ok != 1:
         raise DeviceError(f"the controller refused the request (error {error})")
     if not all(values):
         raise DeviceError("an empty value: the controller does not know the variable")

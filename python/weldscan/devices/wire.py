@@ -12,6 +12,7 @@ import os
 import re
 import select
 import socket
+import struct
 import threading
 import time
 from collections.abc import Callable
@@ -91,6 +92,11 @@ class TcpTransport:
         """Close it."""
         with contextlib.suppress(OSError):  # wakes a thread that waits in receive()
             self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+
+    def reset(self) -> None:
+        """Close it with a reset (RST), as a machine does that lost its memory of the connection."""
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._socket.close()
 
 

@@ -5,7 +5,9 @@ import hashlib
 import json
 import os
 import random
+import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -16,6 +18,7 @@ import numpy as np
 import pytest
 
 from weldscan import DeviceError, DeviceTimeout, InputError, KukaPose
+from weldscan.devices import backend
 from weldscan.devices.camera import Camera, CameraSettings
 from weldscan.devices.controller import Arm, Fault
 from weldscan.devices.kvp import KvpController
@@ -237,6 +240,30 @@ def test_an_operator_moves_the_robot(tmp_path):
 
         assert cell.scan(operator=operator).whole == 3
         assert asked == list(POSES)
+        cell.assert_whole()
+
+
+def free_udp_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.mark.parametrize("link", ["eki", "serial", "rsi"])
+def test_a_scan_over_the_other_links(tmp_path, link):
+    """As over KVP; RSI moves nothing, so there an operator does."""
+    cell = Cell(tmp_path, allow_motion=link != "rsi")
+    cell.controller.close()
+    options = {"port": free_udp_port(), "cycle_s": 0.004} if link == "rsi" else {}
+    with backend("controller", link)(cell.arm, **options) as controller:
+        text = cell.path.read_text().replace('link = "kvp"', f'link = "{link}"')
+        cell.path.write_text(re.sub(r"(?m)^port = .*$", f"port = {json.dumps(controller.port)}", text))
+
+        def operator(shot):
+            cell.arm.place(KukaPose(*POSES[shot.name]))
+            time.sleep(0.05)
+
+        assert cell.scan(operator=operator).whole == 3
         cell.assert_whole()
 
 

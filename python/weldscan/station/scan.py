@@ -108,7 +108,7 @@ def scan(
             return _Scan(settings, plan, store, projector, camera, robot, tell, operator).run()
         except BaseException as error:
             log.error(
-                "stopped with %d of %d shots: %s", len(store.whole), len(plan.shots), error or type(error).__name__
+                "stopped with %d of %d shots: %s", len(store.whole), len(plan.shots), str(error) or type(error).__name__
             )
             raise
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -13,11 +14,15 @@ from weldscan.calibration.hand_eye import (
     POSE_SIGMA_MM,
     POSE_SIGMA_RAD,
     TOUCH_BIAS_SIGMA_MM,
+    _kept,
     point_covariance,
+    pose_sigma,
     solve_hand_eye,
+    write_hand_eye,
 )
 from weldscan.devices.simulated import DEFAULT, placed, tilted_views
 from weldscan.errors import GeometryError, InputError
+from weldscan.report.hand_eye import write_hand_eye_page
 from weldscan.result import HandEye
 
 TRUE = np.asarray(DEFAULT.flange_from_scanner)
@@ -360,3 +365,26 @@ def test_two_equal_distances_are_told_apart_by_the_side_and_three_are_not():
     equilateral = np.stack([28 * np.cos(turns), 28 * np.sin(turns), np.full(3, 415.0)], axis=1)
     with pytest.raises(PlateMismatch, match="too alike"):
         find_plate("artefact-1", caps(equilateral), 20.0, equilateral, FLANGE)
+
+
+def test_the_page_names_outliers(tmp_path):
+    views, poses, touched = drawn(8, AS_STATED, np.random.default_rng(8))
+    poses[3] = placed([0.6, 0.0, 0.0]) @ poses[3]
+    page = write_hand_eye_page(solve_hand_eye(views, poses, touched), tmp_path / "hand-eye.html", "cell <7>")
+    text = page.read_text()
+    assert "artefact-4: an outlier, not used: 0." in text and "artefact-4 (not used)" in text
+    assert "cell &lt;7&gt;" in text and text.count('class="dot"') == 3 * len(views)
+    ElementTree.fromstring(re.search(r"<svg.*?</svg>", text, re.DOTALL)[0])
+    write_hand_eye_page(solve_hand_eye(views[:1], poses[:1], touched), page)
+    page.write_text("mine")
+    with pytest.raises(InputError, match="is no page of a calibration"):
+        write_hand_eye_page(solve_hand_eye(views[:1], poses[:1], touched), page)
+
+
+def test_a_kept_calibration_says_what_the_robot_is_like(tmp_path):
+    found = solve_hand_eye(*drawn(6, SHAKY, np.random.default_rng(9)))
+    kept = write_hand_eye(tmp_path / "hand-eye.json", found)
+    assert kept.pose_sigma_mm == found.pose_sigma_mm and kept.working_point_u_mm == found.working_point_u_mm
+    assert pose_sigma(_kept(kept)) == (found.pose_sigma_mm, found.pose_sigma_rad)
+    older = kept.model_copy(update={"pose_sigma_mm": None, "working_point_u_mm": None})
+    assert np.isnan(_kept(older).working_point_u_mm) and pose_sigma(_kept(older)) == (POSE_SIGMA_MM, POSE_SIGMA_RAD)

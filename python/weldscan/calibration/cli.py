@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from weldscan.result import ScannerCalibration
+    from weldscan.result import HandEye, ScannerCalibration
 
 Tell = Callable[[int, int, str], None]
 Progress = Callable[[], AbstractContextManager[Tell]]
@@ -46,19 +46,58 @@ def hand_eye(
     out: Annotated[Path, typer.Option(help="The file to write; an earlier hand-eye calibration is replaced.")] = Path(
         "hand-eye.json"
     ),
+    page: Annotated[
+        Path | None, typer.Option(help="The page with residuals by shot and sphere. Default: beside --out, .html.")
+    ] = None,
 ) -> None:
-    """Find where the scanner sits on the robot's flange, from shots of the three-sphere plate, and keep it."""
+    """Find where the scanner sits on the robot's flange, from shots of the three-sphere plate, and keep it.
+
+    One shot suffices where the spheres' centres were touched with the robot, 10 to 15 tilted to all sides are good
+    (weldscan calibrate plan proposes them); centres that nobody touched need 5. Shots that contradict the others
+    are named and not used.
+    """
     from weldscan.calibration.hand_eye import calibrate as solve
+    from weldscan.report.hand_eye import check_page, write_hand_eye_page
     from weldscan.session import write_hand_eye
 
+    page = page if page is not None else out.with_suffix(".html")
+    check_page(page)
+    left_out: list[tuple[str, str]] = []
     with _progress() as progress:
-        found = solve(session, progress)
+        found = solve(session, progress, left_out)
     write_hand_eye(out, found)
+    write_hand_eye_page(found, page, session.resolve().name)
+    _show_hand_eye(found, left_out)
+    print(f'         kept in {out}; a session carries it as "hand_eye": "{out.name}"')
+    print(f"         page: {page}")
+
+
+def _show_hand_eye(found: HandEye, left_out: list[tuple[str, str]]) -> None:
+    """The figures of a hand-eye calibration, shot by shot."""
+    import math
+
+    used = sum(shot.outlier is None for shot in found.per_shot)
     print(
-        f"hand-eye {found.id} from {len(found.per_shot)} shots: residual {found.residual_rms_mm:.3f} mm rms, "
+        f"hand-eye {found.id} from {used} shots: residual {found.residual_rms_mm:.3f} mm rms, "
         f"u of a point at the working distance {found.working_point_u_mm:.3f} mm"
     )
-    print(f'         kept in {out}; a session carries it as "hand_eye": "{out.name}"')
+    print("         shot             residuals of spheres 1 2 3, mm   without it, mm   chi2 of 9")
+    for shot in found.per_shot:
+        sizes = "  ".join(f"{sphere.residual_mm or 0.0:.3f}" for sphere in shot.spheres)
+        alone = "-" if shot.left_out_error_mm is None else f"{shot.left_out_error_mm:.3f}"
+        chi2 = "-" if shot.chi2 is None else f"{shot.chi2:.1f}"
+        mark = "" if shot.outlier is None else "   not used"
+        print(f"         {shot.shot:16} {sizes:>31} {alone:>16} {chi2:>11}{mark}")
+    if found.pose_sigma_mm is not None and found.pose_sigma_rad is not None and found.reduced_chi2 is not None:
+        print(
+            f"         robot pose {found.pose_sigma_mm:.3f} mm, "
+            f"{math.degrees(found.pose_sigma_rad):.4f} degrees (k = 1); "
+            f"reduced chi2 under the stated noise {found.reduced_chi2:.2f}"
+        )
+    for name, reason in left_out:
+        print(f"         left out {name}: {reason}")
+    for warning in found.warnings:
+        print(f"         note: {warning}")
 
 
 @calibrate.command(

@@ -651,8 +651,15 @@ def _kept(spec: HandEyeSpec) -> HandEye:
     )
 
 
-def calibrate(session_folder: Path | str, progress: Progress | None = None) -> HandEye:
+def calibrate(
+    session_folder: Path | str, progress: Progress | None = None, left_out: list[tuple[str, str]] | None = None
+) -> HandEye:
     """flange_from_scanner from the artefact shots of a session (`weldscan calibrate hand-eye`).
+
+    Args:
+        session_folder: a `weldscan-session/1` folder with artefact shots; others in it are not looked at.
+        progress: called with (done, total, what).
+        left_out: gets the shots that were not used, with the reason.
 
     Raises:
         InputError: the session is wrong, or the plate in view is not the one that it describes.
@@ -661,7 +668,7 @@ def calibrate(session_folder: Path | str, progress: Progress | None = None) -> H
     session = read_session(session_folder)
     if not session.artefact_shots:
         raise InputError(f"{session.folder / 'session.json'}: shots: none is of the artefact")
-    left_out: list[tuple[str, str]] = []
+    left_out = [] if left_out is None else left_out
     found = hand_eye_of(PointReader(session, progress), left_out)
     if found is None:
         raise NotMeasured("; ".join(f"{name}: {why}" for name, why in left_out))

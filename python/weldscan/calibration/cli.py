@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from weldscan.calibration.plan import Plan
     from weldscan.result import HandEye, ScannerCalibration
 
 Tell = Callable[[int, int, str], None]
@@ -70,6 +71,107 @@ def hand_eye(
     _show_hand_eye(found, left_out)
     print(f'         kept in {out}; a session carries it as "hand_eye": "{out.name}"')
     print(f"         page: {page}")
+
+
+@calibrate.command(
+    "plan", epilog="Example: weldscan calibrate plan pipe-17 --mount '58 -24 112 109 -20 -8' --out hand-eye-plan.json"
+)
+def plan(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SOURCE",
+            help="Scanner, fringes and touched plate: a session's folder, its session.json, or an earlier plan.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="The plan to write; an earlier plan is replaced.")] = Path(
+        "hand-eye-plan.json"
+    ),
+    page: Annotated[
+        Path | None, typer.Option(help="The page with table and pictures. Default: beside --out, .html.")
+    ] = None,
+    shots: Annotated[int, typer.Option(help="How many poses; 10 to 15 are good.")] = 12,
+    mount: Annotated[
+        str | None,
+        typer.Option(help="Roughly where the scanner sits on the flange: X Y Z A B C, mm and degrees.", metavar="POSE"),
+    ] = None,
+    hand_eye: Annotated[
+        Path | None, typer.Option("--hand-eye", help="Or an earlier hand-eye calibration. Default: SOURCE's.")
+    ] = None,
+    distance: Annotated[float, typer.Option(help="Working distance of the camera, mm.")] = 420.0,
+    depth: Annotated[float, typer.Option(help="Half the depth of the working volume, mm.")] = 40.0,
+    reach: Annotated[
+        tuple[float, float], typer.Option(help="Least and most distance of the flange from base's origin, mm.")
+    ] = (250.0, 1100.0),
+    lowest: Annotated[float, typer.Option(help="Least height of the flange in base, mm.")] = 0.0,
+    cone: Annotated[float, typer.Option(help="How far the flange may turn from straight down, degrees.")] = 180.0,
+) -> None:
+    """Propose flange poses for a hand-eye calibration, and say how good it will be.
+
+    Poses tilted by 30 to 45 degrees to all sides of the plate, rolled, near and far: of all that robot and scanner
+    allow, those after which a point at the working distance is known best. The plan is a session without images:
+    [scan] plan = "..." in cell.toml, weldscan scan, weldscan calibrate hand-eye.
+    """
+    import numpy as np
+
+    from weldscan.calibration import plan as planning
+    from weldscan.errors import InputError
+    from weldscan.report.hand_eye import check_page
+    from weldscan.report.plan import write_plan_page
+    from weldscan.session import read_hand_eye
+
+    page = page if page is not None else out.with_suffix(".html")
+    check_page(page)
+    planning.check_plan(out)
+    if mount is not None and hand_eye is not None:
+        raise InputError("--mount and --hand-eye: only one of them")
+    given = planning.read_source(source)
+    with _progress() as progress:
+        progress(0, 2, "where the scanner sits")
+        if mount is not None:
+            where = planning.mount_of(mount)
+        elif hand_eye is not None:
+            where = np.array(read_hand_eye(hand_eye).flange_from_scanner)
+        else:
+            where = planning.mounted(given, source)
+        progress(1, 2, "choosing poses")
+        found = planning.plan_poses(
+            given.scanner.build(),
+            where,
+            np.array(given.artefact.centres_base),
+            given.artefact.sphere_diameter,
+            shots=shots,
+            limits=planning.Limits(distance, depth, reach, lowest, cone),
+            noise=planning.noise_of(given),
+        )
+    planning.write_plan(out, planning.document(given, found))
+    write_plan_page(found, page, given.name)
+    _show_plan(found)
+    print(f'plan: {out}; [scan] plan = "{out.name}" in cell.toml, then weldscan scan, weldscan calibrate hand-eye')
+    print(f"page: {page}")
+
+
+def _show_plan(found: Plan) -> None:
+    """The poses, and what they give."""
+    import math
+
+    print(f"{len(found.shots)} poses of {found.possible} possible ones ({found.candidates} tried)")
+    print("         shot              X         Y         Z         A         B         C   tilt side  roll  mm away")
+    for i, shot in enumerate(found.shots):
+        numbers = "".join(f"{value:10.3f}" for value in shot.pose.values())
+        print(
+            f"         artefact-{i + 1:<3}{numbers} {shot.tilt_deg:6.1f}° {shot.around_deg:3.0f}° "
+            f"{shot.roll_deg:4.0f}° {shot.distance_mm:6.0f}"
+        )
+    stated = found.noise
+    print(
+        f"predicted u of a point at {found.limits.distance_mm:g} mm: {found.u_mm[-1]:.3f} mm (k = 1, worst axis) with "
+        f"poses good to {stated.pose_mm:g} mm and {math.degrees(stated.pose_rad):.4f}°, touches to {stated.touch_mm:g} "
+        f"mm; {found.u_untouched_mm:.3f} mm from the shots alone"
+    )
+    print(f"turned against each other by {found.tilts_deg[0]:.0f}° and, about a second axis, {found.tilts_deg[1]:.0f}°")
+    for reason, count in found.dropped.items():
+        print(f"         {count} poses dropped: {reason}")
 
 
 def _show_hand_eye(found: HandEye, left_out: list[tuple[str, str]]) -> None:

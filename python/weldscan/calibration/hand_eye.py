@@ -87,7 +87,8 @@ def rotation_of(w: Floats) -> Floats:
     return np.asarray(np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k)
 
 
-def _inverse(t: Floats) -> Floats:
+def inverse(t: Floats) -> Floats:
+    """Of a rigid transform."""
     out = np.eye(4)
     out[:3, :3] = t[:3, :3].T
     out[:3, 3] = -t[:3, :3].T @ t[:3, 3]
@@ -308,7 +309,7 @@ def _problem(
             f"artefact.centres_base: {names[0]}: the plate is mirrored: its spheres run the other way round than those "
             "in view"
         )
-    return _Problem(names, np.array([_inverse(pose) for pose in poses]), seen, seen_cov, touched, noise)
+    return _Problem(names, np.array([inverse(pose) for pose in poses]), seen, seen_cov, touched, noise)
 
 
 def tilts_rad(base_from_flange: Sequence[Floats]) -> tuple[float, float]:

@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from conftest import shared
 from test_simulate import small_scanner
 from weldscan import GeometryError, InputError, Verdict, inspect
 from weldscan.devices.simulated import DEFAULT, simulate_session
@@ -34,6 +35,7 @@ from weldscan.verification import (
     verify,
 )
 from weldscan.verification.history import append_history, check_history, read_history, slope, standing_of, with_drift
+from weldscan.verification.standards import caps
 
 # Sums of some thousand coordinates of 500 mm in double precision.
 ROUNDING_MM = 1e-9
@@ -143,6 +145,22 @@ def test_points_that_are_no_surface():
 def test_the_same_place_counts_once():
     at = [np.array([[0.0, 0, 400]]), np.array([[9.0, 0, 400]]), np.array([[11.0, 0, 400]]), np.array([[0.0, 0, 400]])]
     assert places(at, 10.0) == 2 and places([], 10.0) == 0
+
+
+def test_the_pixels_that_see_a_cap():
+    lens = small_scanner(2).camera
+    middle = np.array([0.0, 0.0, 400.0])
+    # Behind the first one, and half of it beyond the left edge of the image.
+    behind = np.array([10.0, 0.0, 460.0])
+    edge = np.array([(-0.5 - lens.K[0, 2]) / lens.K[0, 0] * 400, 0.0, 400.0])
+    (whole, hidden, cut) = caps(lens, np.array([middle, behind, edge]), 10.0)
+    pixels, outward, all_of_it = whole
+    assert len(pixels) == all_of_it and np.all(np.diff(pixels) > 0)
+    # Orthographic area of the cap: pi (R sin 60)^2, in pixels of z/f; seen in perspective a little more.
+    assert all_of_it == pytest.approx(math.pi * (8.66 * lens.K[0, 0] / 400) ** 2, rel=0.05)
+    assert np.linalg.norm(outward, axis=1) == pytest.approx(1.0) and outward[:, 2].max() <= -0.5 + 1e-9
+    assert 0.3 < len(hidden[0]) / hidden[2] < 0.7 and not set(hidden[0]) & set(pixels)
+    assert 0.4 < len(cut[0]) / cut[2] < 0.6
 
 
 # --- the verdict ------------------------------------------------------------------------------------------------------
@@ -604,6 +622,19 @@ def test_without_limits_nothing_is_judged(session, tmp_path):
     assert other.verdict is Verdict.NOT_ASSESSABLE and other["F"].value_mm > 0 and other["PF"].value_mm is None
 
 
+@pytest.mark.parametrize("name", ["open-630", "open-273"])
+def test_a_scanner_of_an_independent_renderer(name):
+    """Highlights and light between surfaces: a few points are far off, and most are not."""
+    found = verify(shared(f"sessions/{name}"), {**WIDE, "share": 0.997})
+    # Touched centres: five times their standard uncertainty of 0.028 mm. Sizes: a tenth of a camera pixel each side.
+    assert found["SD"].positions == 18 and abs(found["SD"].value_mm) < 0.14
+    assert abs(found["PS"].value_mm) < 0.05 and found.lost == ()
+    assert 0 < sum(ball.wild for ball in found.balls) < 1e-3 * sum(ball.points for ball in found.balls)
+    assert np.median([ball.form_95_mm for ball in found.balls]) < 0.3
+    everything = verify(shared(f"sessions/{name}"), WIDE)
+    assert everything["PF"].verdict is Verdict.FAIL and "far off the surface" in everything["PF"].reason
+
+
 # --- what inspect makes of it -----------------------------------------------------------------------------------------
 
 
@@ -633,6 +664,21 @@ def test_what_a_session_may_rely_on(session, tmp_path, verdict, day, scanner, sa
     assert accepted.relied_on and "checked by hand" in accepted.statement
     with pytest.raises(InputError, match="give the reason"):
         standing_of(read, path, "  ")
+
+
+def test_a_history_that_was_changed_is_not_relied_upon(session, tmp_path, three_lines):
+    read, path = read_session(session), tmp_path / "v.jsonl"
+    append_history(path, made_up(Verdict.FAIL, day=-5, scanner=scanner_id(read.scanner)))
+    append_history(path, made_up(day=-4, scanner=scanner_id(read.scanner)))
+    assert standing_of(read, path).good
+    path.write_bytes(path.read_bytes().split(b"\n", 1)[1])
+    assert not standing_of(read, path).good and "cannot be relied upon" in standing_of(read, path).text
+    # An unfinished line is said, and the one before it counts.
+    path.unlink()
+    append_history(path, made_up(day=-4, scanner=scanner_id(read.scanner)))
+    with path.open("ab") as file:
+        file.write(three_lines[:200])
+    assert standing_of(read, path).good and "unfinished" in standing_of(read, path).notes[0]
 
 
 def test_where_the_history_is_looked_for(session, tmp_path):

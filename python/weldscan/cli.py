@@ -308,7 +308,9 @@ def _told(found: Verification, out: Path, history: Path | None) -> None:
         print(f"       drift of {drift.name}: {drift.text}")
     for note in (*found.assumed, *found.notes, *found.warnings):
         print(f"       note: {note}")
-    if history is not None:
+    if history is None:
+        print("       history: none is kept; --history FILE adds this verification to one")
+    else:
         judged = found.verdict is not Verdict.NOT_ASSESSABLE
         print(f"       history: {history}" if judged else f"       nothing was judged, so {history} was left as it is")
     print(f"       report: {out / 'verification.html'}")

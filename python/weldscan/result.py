@@ -524,6 +524,15 @@ class Verification:
         given = {each.verdict for each in self.characteristics if each.limit_mm is not None}
         return next((verdict for verdict in order if verdict in given), Verdict.NOT_ASSESSABLE)
 
+    @property
+    def span_mm(self) -> tuple[float, float, float]:
+        """How far the positions reach along the scanner's x, y and z."""
+        places = [*(b.centre_mm[None] for b in self.balls), *(p.corners_mm for p in self.planes)]
+        if not places:
+            return 0.0, 0.0, 0.0
+        x, y, z = np.ptp(np.concatenate(places), axis=0).tolist()
+        return x, y, z
+
     def __getitem__(self, name: str) -> Characteristic:
         """PF, PS, SD or F."""
         return next(each for each in self.characteristics if each.name == name)

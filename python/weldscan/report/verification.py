@@ -69,6 +69,7 @@ def document(found: Verification, created: datetime) -> dict[str, Any]:
         "valid_until": found.valid_until,
         "verdict": found.verdict,
         "limits": found.limits,
+        "span_mm": found.span_mm,
         "characteristics": {
             each.name: {name: value for name, value in vars(each).items() if name != "name"}
             for each in found.characteristics
@@ -216,7 +217,8 @@ def volume(found: Verification, characteristic: Characteristic) -> Svg:
         if label == characteristic.where or label.replace(", ", ", spheres ", 1) == characteristic.where:
             x, y = front(place.mean(axis=0))
             svg.add("circle", cx=x, cy=y, r=10.5, class_="worst")
-    svg.colour_bar(height - 42, full, "too small", "too large, mm" if limit is None else "the limit, mm")
+    below = "" if characteristic.name in ("PF", "F") else "too small"
+    svg.colour_bar(height - 42, full, below, "mm" if limit is None else "the limit, mm")
     return svg
 
 

@@ -101,6 +101,7 @@ def judge_characteristic(
     positions: int,
     points: Sequence[int] = (),
     lost: Sequence[str] = (),
+    beside: str = "",
 ) -> Characteristic:
     """One characteristic over all positions, judged by the value furthest from zero.
 
@@ -142,8 +143,24 @@ def judge_characteristic(
         limit_mm=limit,
         u_mm=u_mm,
         verdict=verdict,
-        reason=reason,
+        reason=reason + (f" ({beside})" if beside else ""),
     )
+
+
+def _other_ranges(standards: Sequence[BallError | PlaneError], judged: float) -> str:
+    """The largest ranges over the other shares of the points, and how many points are wild."""
+    if not standards:
+        return ""
+    every = {
+        1.0: [s.form_all_mm if isinstance(s, BallError) else s.flatness_all_mm for s in standards],
+        0.997: [s.form_997_mm if isinstance(s, BallError) else s.flatness_997_mm for s in standards],
+        0.95: [s.form_95_mm if isinstance(s, BallError) else s.flatness_95_mm for s in standards],
+    }
+    parts = [f"{max(values):.4f} mm over {100 * share:g} %" for share, values in every.items() if share != judged]
+    wild = sum(each.wild for each in standards)
+    if wild:
+        parts.append(f"{wild} of {sum(each.points for each in standards)} points far off the surface")
+    return f"judged over {100 * judged:g} % of the points; {', '.join(parts)}"
 
 
 def scanner_id(scanner: ScannerSpec) -> str:
@@ -283,6 +300,7 @@ def verify(
             "python": platform.python_version(),
             "numpy": np.__version__,
             "session_sha256": session.sha256,
+            **({} if session.scanner.id is None else {"scanner_calibration": session.scanner.id}),
         },
     )
 
@@ -348,6 +366,7 @@ def _characteristics(
             positions=positions,
             points=[each.points for each in standards],
             lost=on_planes if name == "F" else on_balls,
+            beside="" if name in ("PS", "SD") else _other_ranges(standards, limits.share),
         )
 
     return (

@@ -48,7 +48,7 @@ def touched_distance_u_mm(artefact: ArtefactSpec) -> float:
     return 2 * math.sqrt(2) * (artefact.touch_sigma_mm or TOUCH_SIGMA_MM)
 
 
-def caps(lens: Lens, centres_mm: Floats, radius_mm: float) -> list[tuple[NDArray[np.intp], Floats]]:
+def caps(lens: Lens, centres_mm: Floats, radius_mm: float) -> list[tuple[NDArray[np.intp], Floats, int]]:
     """Per sphere, the pixels whose rays meet its 120 degree cap before any other sphere, and where they meet it.
 
     Args:
@@ -57,28 +57,27 @@ def caps(lens: Lens, centres_mm: Floats, radius_mm: float) -> list[tuple[NDArray
         radius_mm: of the spheres.
 
     Returns:
-        A pair for each: flat pixel indices, ascending, and (k, 3) unit vectors from the centre to the surface.
+        For each: flat pixel indices, ascending; (k, 3) unit vectors from the centre to the surface; and how many pixels
+        the cap has, those beyond the image's edge and behind other spheres with it.
     """
     found = []
     for i, centre in enumerate(centres_mm):
         middle = lens.project(centre[None])[0]
         # The outline is a little wider than f R / z; a lens stretches it by less than the rest.
         reach = 1.5 * radius_mm * float(lens.K[0, 0]) / max(float(centre[2]), radius_mm)
-        low = np.maximum(np.floor(middle - reach), 0).astype(int)
-        high = np.minimum(np.ceil(middle + reach) + 1, (lens.width, lens.height)).astype(int)
+        low, high = np.floor(middle - reach).astype(int), np.ceil(middle + reach).astype(int) + 1
         column, row = (g.ravel() for g in np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])))
-        if column.size == 0:
-            found.append((np.zeros(0, np.intp), np.zeros((0, 3))))
-            continue
         ray = np.column_stack([lens.undistort(np.column_stack([column, row]).astype(float)), np.ones(column.size)])
         ray /= np.linalg.norm(ray, axis=1)[:, None]
         depth = _first_hit(ray, centre, radius_mm)
+        with np.errstate(invalid="ignore"):
+            outward = (depth[:, None] * ray - centre) / radius_mm
+            on_cap = np.isfinite(depth) & (outward @ (-centre / np.linalg.norm(centre)) >= CAP_COS)
+        whole = int(on_cap.sum())
         for other in np.delete(centres_mm, i, axis=0):
-            depth[_first_hit(ray, other, radius_mm) < depth] = np.inf
-        hit = np.isfinite(depth)
-        outward = (depth[hit, None] * ray[hit] - centre) / radius_mm
-        on_cap = outward @ (-centre / np.linalg.norm(centre)) >= CAP_COS
-        found.append(((row[hit] * lens.width + column[hit])[on_cap].astype(np.intp), outward[on_cap]))
+            on_cap &= _first_hit(ray, other, radius_mm) > depth
+        on_cap &= (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
+        found.append(((row[on_cap] * lens.width + column[on_cap]).astype(np.intp), outward[on_cap], whole))
     return found
 
 
@@ -211,10 +210,10 @@ def ball_errors(
     rough = np.array([sphere.center_mm for sphere in spheres])
     balls: list[BallError] = []
     centres: list[Floats] = []
-    for i, (pixels, outward) in enumerate(caps(lens, rough, float(spheres[0].radius_mm))):
+    for i, (pixels, outward, whole) in enumerate(caps(lens, rough, float(spheres[0].radius_mm))):
         good = np.isfinite(flat[pixels]).all(axis=1)
         points = flat[pixels][good]
-        seen = float(good.mean()) if good.size else 0.0
+        seen = len(points) / max(whole, 1)
         if seen < LEAST_SEEN or len(points) < LEAST_POINTS:
             raise GeometryError(
                 f"sphere {i + 1}: {len(points)} points on {100 * seen:.0f} % of its 120° cap; "

@@ -284,6 +284,17 @@ def test_opencv_unplugged(scene, request, monkeypatch):
             camera.capture()
 
 
+def test_opencv_that_waits_for_ever(scene, request, monkeypatch):
+    """As OpenCV does for 10 s when the frames of a camera stop coming."""
+    with open_camera("opencv", scene, request, monkeypatch, timeout_s=0.3) as camera:
+        camera.capture()
+        monkeypatch.setattr(camera._capture, "grab", lambda: time.sleep(2.0))
+        start = time.monotonic()
+        with pytest.raises(DeviceTimeout, match="unplugged"):
+            camera.capture()
+        assert time.monotonic() - start < 1.5
+
+
 def test_opencv_nothing_there(monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", V4l2)
     camera = backend("camera", "opencv")

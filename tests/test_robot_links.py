@@ -18,6 +18,7 @@ from weldscan.devices.robot import distance, wait_until_still
 from weldscan.devices.rsi import RsiController, RsiRobot, RsiSettings
 from weldscan.devices.serial import SerialController, SerialRobot, SerialSettings, cut_line
 from weldscan.devices.wire import ConnectionLost, Link
+from weldscan.pose import format_frame
 
 TIMEOUT_S = 0.6
 LATE_S = 0.7
@@ -230,6 +231,16 @@ def test_kvp_needs_our_program_running(arm, state):
         with pytest.raises(DeviceError, match="must be running"):
             robot.move_to(NEAR)
         assert close_to(arm.flange(), FLANGE)
+
+
+def test_kvp_waits_for_a_motion_that_a_killed_client_began(arm):
+    arm.speed_mm_s = 5.0
+    controller, robot = connect("kvp", arm, allow_motion=True)
+    with controller, robot:
+        robot.set("COM_TARGET", format_frame(KukaPose(613.825, *FLANGE.values()[1:])))
+        robot.set("COM_ACTION", "1")
+        assert arm.moving
+        assert distance(robot.move_to(NEAR).flange, NEAR)[0] < 0.1
 
 
 def single(text):

@@ -214,6 +214,7 @@ class KvpRobot(StreamRobot):
     def _move(self, target: KukaPose, give_up_s: float) -> None:
         """Target first, trigger last; then wait until the program has done it."""
         self._check_program()
+        self._wait_until_idle(give_up_s)  # it may still be at what a scan wanted that was killed
         self.set("COM_TARGET", format_frame(target))
         (text,) = self.get("COM_TARGET")
         try:
@@ -223,10 +224,13 @@ class KvpRobot(StreamRobot):
         if off_mm > SINGLE_MM or off_deg > SINGLE_DEG:
             raise DeviceError(f"{self.name}: the controller took another target: {text}")
         self.set("COM_ACTION", "1")
+        self._wait_until_idle(give_up_s)
+
+    def _wait_until_idle(self, give_up_s: float) -> None:
         while self.get("COM_ACTION")[0].strip() != "0":
             self._check_program()
             if time.monotonic() > give_up_s:
-                self.set("COM_ACTION", "0")
+                self.set("COM_ACTION", "0")  # what has not begun shall not begin when nobody expects it
                 raise DeviceTimeout(f"{self.name}: the program did not finish the motion")
             time.sleep(POLL_S)
 
@@ -321,7 +325,8 @@ class KvpController(TcpController):
 
     def _set(self, name: str, value: str) -> None:
         self.variables[name] = value
-        if name == "COM_ACTION" and value == "1" and self.arm.mode == "#T1":
+        # As the program does it: it looks at COM_ACTION when it has arrived, and in T1 alone.
+        if name == "COM_ACTION" and value == "1" and self.arm.mode == "#T1" and not self.arm.moving:
             try:
                 self.arm.move(parse_frame(self.variables["COM_TARGET"]))
             except (OutOfReach, InputError):  # the controller stops a program that it cannot go on with

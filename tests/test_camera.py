@@ -1,6 +1,7 @@
 """One suite for every camera: simulated, a folder, Aravis and pylon against their own simulators, OpenCV on a stand-
 in."""
 
+import json
 import shutil
 import subprocess
 import threading
@@ -16,6 +17,8 @@ from weldscan.devices.camera import Camera, CameraSettings, TornFrame
 
 WIDTH, HEIGHT = 640, 480
 FAKE = "arv-fake-gv-camera-0.8"
+SMALL_PACKETS = 140
+"""For the small images of the scan's tests: 17 packets each, of which all arrive for 7 images of 10."""
 LARGE_PACKETS = 32_000
 """Aravis's fake camera resends nothing; of its 1,400 byte packets 2 % lost leave no whole image. Loopback takes
 large ones."""
@@ -179,6 +182,30 @@ def test_aravis_lost_packets_become_retries(fake_gige, soak):
         frames = [device.capture() for _ in range(200 if soak else 10)]
         assert sum(frame.retries for frame in frames) > 0  # 40 packets a frame: 0.45 of the frames are whole at once
         assert all(is_whole(frame.image) for frame in frames)
+
+
+def test_no_torn_image_in_a_shot(fake_gige, tmp_path):
+    """A scan through a camera whose packets get lost: every image that was kept is whole."""
+    from test_scan import HEIGHT, WIDTH, Cell
+
+    name, _ = fake_gige("-r", "20")
+    scanning = Cell(tmp_path)
+    plan = json.loads((tmp_path / "plan.json").read_text())
+    plan["shots"] = [plan["shots"][0] | {"exposures": None}, plan["shots"][2] | {"exposures": None}]
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    text = scanning.path.read_text()
+    section = (
+        f'[camera]\nbackend = "aravis"\ndevice = "{name}"\nwidth = {WIDTH}\nheight = {HEIGHT}\nexposure_s = 0.01\n'
+        f"timeout_s = 30.0\nretries = 100\npacket_size = {SMALL_PACKETS}\n"
+    )
+    text = text[: text.index("[camera]")] + section + text[text.index("[projector]") :]
+    scanning.path.write_text(text + "least_usable = 0.0\nmost_saturated = 1.0\n")  # it draws a ramp, not our fringes
+    with scanning.controller:
+        assert scanning.scan().whole == 2
+    assert "torn frames" in (scanning.out / "scan.log").read_text()
+    images = sorted((scanning.out / "shots").glob("*/*.png"))
+    assert len(images) == 2 * 9
+    assert all(is_whole(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)) for path in images)
 
 
 def test_aravis_unplugged(fake_gige, soak):

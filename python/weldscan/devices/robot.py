@@ -100,6 +100,8 @@ class Robot(abc.ABC):
     """
 
     Settings: ClassVar[type[RobotSettings]] = RobotSettings
+    moves: ClassVar[bool] = True
+    """Can this link ask for motion at all?"""
     settings: RobotSettings
     name: str
     _last: StampedPose | None = None
@@ -141,6 +143,8 @@ class Robot(abc.ABC):
         Refused unless the configuration allows motion, the controller says T1, and the target is near. Returns only
         when the MEASURED pose is at the target and at rest; otherwise raises.
         """
+        if not self.moves:
+            raise DeviceError(f"{self.name}: this link only reads")
         if not self.settings.allow_motion:
             raise DeviceError(f"{self.name}: motion is off; allow_motion = true in the configuration allows it")
         reading = self.read()
@@ -156,7 +160,8 @@ class Robot(abc.ABC):
         return self._arrive(target, give_up_s)
 
     def _move(self, target: KukaPose, give_up_s: float) -> None:
-        raise DeviceError(f"{self.name}: this link only reads")
+        """Ask for the motion, as the link does it, and wait for the controller's word that it is over."""
+        raise NotImplementedError
 
     def _arrive(self, target: KukaPose, give_up_s: float) -> StampedPose:
         """Wait until the measured pose is at the target and at rest: the controller's word alone proves nothing."""

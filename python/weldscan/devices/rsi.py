@@ -52,6 +52,7 @@ class RsiRobot(Robot):
     """The pose stream of a robot that runs RSI. The link cannot move the robot."""
 
     Settings = RsiSettings
+    moves = False
     settings: RsiSettings
 
     def __init__(self, settings: RsiSettings) -> None:

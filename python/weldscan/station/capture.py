@@ -4,6 +4,7 @@ enough.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from weldscan.devices.camera import Camera, Image
 from weldscan.devices.projector import Pattern, Projector, whole_refreshes
 
+log = logging.getLogger("weldscan.scan")
 Sets = Sequence[tuple[str, float, int]]
 
 
@@ -40,11 +42,14 @@ def capture_stack(
     camera: Camera, projector: Projector, patterns: Iterable[Pattern], each: Callable[[], None] = lambda: None
 ) -> list[Image]:
     """Show each pattern, wait until it is surely on the wall, take one frame of it."""
-    images = []
+    images: list[Image] = []
     for pattern in patterns:
         projector.show(pattern)
         time.sleep(projector.settle_s)
-        images.append(camera.capture().image)
+        frame = camera.capture()
+        if frame.retries:
+            log.info("image %d: %d torn frames before it", len(images), frame.retries)
+        images.append(frame.image)
         each()
     return images
 

@@ -272,6 +272,11 @@ def read_settings(cell: CellConfig) -> tuple[ScanSettings, Session]:
     return settings, plan
 
 
+class _LogFile(logging.FileHandler):
+    def handleError(self, record: logging.LogRecord) -> None:
+        """A log that cannot be written, on a full disk, says nothing of its own."""
+
+
 class _log_to:
     """One log per session folder."""
 
@@ -280,7 +285,7 @@ class _log_to:
 
     def __enter__(self) -> None:
         try:
-            self.handler = logging.FileHandler(self.path, encoding="utf-8")
+            self.handler = _LogFile(self.path, encoding="utf-8")
         except OSError as error:
             raise InputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
         self.handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))

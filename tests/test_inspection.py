@@ -224,6 +224,23 @@ def test_without_a_robot_one_shot_is_measured(tmp_path):
     assert abs(error) <= unaided.step.expanded_uncertainty_mm
 
 
+def test_shots_that_saw_the_same_wall_are_held_against_each_other(recorded, tmp_path):
+    folder, _, found = recorded
+    (pair,) = found.agreement
+    assert pair.shots == ("part-1", "part-2") and pair.cells > 100
+    assert abs(pair.difference_mm) <= pair.expanded_uncertainty_mm < 0.4
+    assert not any("disagree" in warning for warning in found.warnings)
+
+    def move(document):
+        document["shots"][-1]["flange_pose"]["Y"] += 1.0
+
+    moved = inspect(respelt(folder, tmp_path / "session", move))
+    assert abs(abs(moved.agreement[0].difference_mm - pair.difference_mm) - 1.0) < 0.1
+    (said,) = [warning for warning in moved.warnings if "disagree" in warning]
+    assert said.startswith("part-1 and part-2 disagree by ") and "the step is not" in said
+    np.testing.assert_allclose(moved.step.step_mm, found.step.step_mm, atol=0.005)
+
+
 def flatten(shot: Path) -> None:
     """Makes all images of a shot alike."""
     for path in shot.glob("0*.png"):

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldscan._weldcore import WeldShot, __version__, measure_step, place_shots, segment_weld
+from weldscan.agreement import PlacedShot, agreement, complaint
 from weldscan.calibration.hand_eye import (
     base_from_flange,
     hand_eye_of,
@@ -28,7 +29,7 @@ from weldscan.manifest import left_out as left_out_of
 from weldscan.norms import judge, load_norm
 from weldscan.paper_method import paper_step
 from weldscan.points import PointReader, Progress
-from weldscan.result import BudgetLine, HandEye, Histogram, Inspection, PartCloud, StepResult
+from weldscan.result import BudgetLine, HandEye, Histogram, Inspection, PartCloud, ShotAgreement, StepResult
 from weldscan.session import PartSpec, ShotSpec, read_session
 from weldscan.verification.history import standing_of
 
@@ -96,6 +97,12 @@ class _Weld:
     base_from_scanner: Floats
     shot: WeldShot
 
+    @property
+    def axis_in_base(self) -> tuple[Floats, Floats]:
+        """A point of the pipe's axis, and its direction."""
+        turn, shift = self.base_from_scanner[:3, :3], self.base_from_scanner[:3, 3]
+        return turn @ self.shot.origin_mm + shift, turn @ self.shot.axis
+
 
 class _Run:
     """One inspection under way: the session, and what went wrong."""
@@ -120,6 +127,7 @@ class _Run:
         self.method, self.norms = method, tuple(norms)
         self.standing = standing_of(self.session, history, accept_verification)
         self.read = PointReader(self.session, progress)
+        self.agreement: tuple[ShotAgreement, ...] = ()
         self.left_out: list[tuple[str, str]] = list(left_out_of(self.session.folder))
         unusable = {name for name, _ in self.left_out}
         self.part_shots = [shot for shot in self.session.part_shots if shot.name not in unusable]
@@ -176,14 +184,23 @@ class _Run:
             )
         )
         t = self.read.clock("place", t)
+        if hand_eye is not None and len(welds) > 1:
+            self.hold_together(cloud, welds, hand_eye)
+            t = self.read.clock("agreement", t)
         histogram = self.paper(cloud, welds[0])
         self.read.clock("paper", t)
         return _step_result(step, histogram), cloud
 
+    def hold_together(self, cloud: PartCloud, welds: Sequence[_Weld], hand_eye: HandEye) -> None:
+        """Shots that saw the same wall, held against each other in base."""
+        shots = [(w.index, self.session.part_shots[w.index]) for w in welds]
+        placed = [PlacedShot(shot.name, index, base_from_flange(shot)) for index, shot in shots]
+        self.agreement = agreement(cloud, placed, hand_eye, *welds[0].axis_in_base)
+        self.read.warnings.extend(said for pair in self.agreement if (said := complaint(pair)) is not None)
+
     def paper(self, cloud: PartCloud, weld: _Weld) -> Histogram | None:
         """The paper's chain; None with a warning where it finds no answer."""
-        turn, shift = weld.base_from_scanner[:3, :3], weld.base_from_scanner[:3, 3]
-        origin, axis = turn @ weld.shot.origin_mm + shift, turn @ weld.shot.axis
+        origin, axis = weld.axis_in_base
         try:
             return paper_step(cloud.points_mm, origin, axis, weld.shot.radius_mm)
         except GeometryError as error:
@@ -232,6 +249,7 @@ class _Run:
                 "session_sha256": self.session.sha256,
             },
             verification=self.standing,
+            agreement=self.agreement,
         )
 
     def paper_uncertainty_mm(self, step: StepResult, cloud: PartCloud | None, hand_eye: HandEye | None) -> float | None:

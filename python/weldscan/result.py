@@ -153,6 +153,21 @@ class HandEye:
     """What whoever calibrates should know: outliers, a robot or probe worse than stated, poses too alike."""
 
 
+@dataclass(frozen=True)
+class ShotAgreement:
+    """Two part shots where both saw a wall, placed in base."""
+
+    shots: tuple[str, str]
+    cells: int
+    """How many cells of 4 mm both saw."""
+    difference_mm: float
+    """The second shot's wall above the first one's, radially, median."""
+    rms_mm: float
+    """Of the cells' differences."""
+    expanded_uncertainty_mm: float
+    """Of `difference_mm`, k = 2: hand-eye and two flange poses."""
+
+
 @dataclass(frozen=True, eq=False)
 class PartCloud:
     """Every measured point of the part, in base (in the scanner's frame where there is no robot)."""
@@ -226,6 +241,8 @@ class Inspection:
     software: dict[str, str]
     verification: Standing | None = None
     """What is on record about the scanner."""
+    agreement: tuple[ShotAgreement, ...] = ()
+    """Part shots that saw a wall together, held against each other."""
 
     @property
     def judged_mm(self) -> float | None:

@@ -46,6 +46,7 @@ from weldscan.session import (
     Session,
     ShotSpec,
     explain,
+    named_scanner,
     read_hand_eye,
     read_text,
     to_json,
@@ -151,8 +152,14 @@ def read_source(path: str | os.PathLike[str]) -> PlanSource:
     """
     path = Path(path)
     file = path / "session.json" if path.is_dir() else path
+    text = read_text(file)
     try:
-        source = PlanSource.model_validate_json(read_text(file))
+        content = json.loads(text)
+        if isinstance(content, dict) and isinstance(content.get("scanner"), str):
+            text = json.dumps(content | {"scanner": named_scanner(file, content["scanner"])})
+        source = PlanSource.model_validate_json(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{file}: is not JSON: {error.msg} in line {error.lineno}, column {error.colno}") from None
     except ValidationError as error:
         raise InputError(f"{file}: {explain(error)}") from None
     if source.artefact.centres_base is None:

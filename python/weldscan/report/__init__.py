@@ -113,6 +113,7 @@ def result_document(inspection: Inspection, created: datetime) -> dict[str, Any]
             for line in (step.budget if step else ())
         ],
         "hand_eye": _hand_eye(hand_eye),
+        "agreement": [vars(pair) for pair in inspection.agreement],
         "counts": counts(inspection.cloud),
         "verdicts": [_judgement(judgement) for judgement in inspection.verdicts],
         "verification": None if inspection.verification is None else vars(inspection.verification),

@@ -130,7 +130,7 @@ def order_complaint(view: PlateView, reference_mm: Floats, touched: bool) -> str
     orders = sorted(permutations(range(3)), key=lambda order: float(np.square(misfit(order)).sum()))
     if np.all(np.abs(misfit((0, 1, 2))) <= doubt):
         return None
-    best, said = orders[0], "touched" if touched else "those of the first shot"
+    best, said = orders[0], "those touched" if touched else "those of the first shot"
     if np.all(np.abs(misfit(best)) <= doubt):
         order = ", ".join(str(i + 1) for i in best)
         worst = float(np.abs(misfit((0, 1, 2))).max())

@@ -445,9 +445,10 @@ def solve_hand_eye(
 
 
 def _undetermined(u_mm: float, turned: tuple[float, float]) -> GeometryError:
+    known = f"be known to {u_mm:.2g} mm" if math.isfinite(u_mm) else "not be known"
     return GeometryError(
-        f"the poses do not determine the hand-eye transform: a point at the working distance would be known to "
-        f"{u_mm:.2g} mm; they are turned against each other by {math.degrees(turned[0]):.1f} degrees about one "
+        f"the poses do not determine the hand-eye transform: a point at the working distance would {known}; "
+        f"they are turned against each other by {math.degrees(turned[0]):.1f} degrees about one "
         f"axis and {math.degrees(turned[1]):.1f} about a second, 30 to 45 about two are needed"
     )
 

@@ -136,15 +136,11 @@ def test_bad_table_files(tmp_path):
 # --- the window -------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def screen(tmp_path, monkeypatch):
-    """An X server with a framebuffer in a file: two displays side by side, the second one the projector's."""
-    if shutil.which("Xvfb") is None:
-        pytest.skip("Xvfb (Debian: xvfb) is not installed")
-    pytest.importorskip("pygame", reason="pygame-ce is not installed")
+def start_screen(folder):
+    """An X server with a framebuffer in a file, two displays side by side, and its name."""
     reader, writer = os.pipe()
     server = subprocess.Popen(
-        ["Xvfb", "-displayfd", str(writer), "-screen", "0", f"{SCREEN[0]}x{SCREEN[1]}x24", "-fbdir", str(tmp_path)],
+        ["Xvfb", "-displayfd", str(writer), "-screen", "0", f"{SCREEN[0]}x{SCREEN[1]}x24", "-fbdir", str(folder)],
         pass_fds=(writer,),
         stderr=subprocess.DEVNULL,
     )
@@ -153,7 +149,17 @@ def screen(tmp_path, monkeypatch):
         number = said.readline().strip()
     if not number:
         pytest.skip("Xvfb does not start here")
-    monkeypatch.setenv("DISPLAY", f":{number}")
+    return server, f":{number}"
+
+
+@pytest.fixture
+def screen(tmp_path, monkeypatch):
+    """Two displays, the second one the projector's."""
+    if shutil.which("Xvfb") is None:
+        pytest.skip("Xvfb (Debian: xvfb) is not installed")
+    pytest.importorskip("pygame", reason="pygame-ce is not installed")
+    server, name = start_screen(tmp_path)
+    monkeypatch.setenv("DISPLAY", name)
     monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
     yield server, tmp_path / "Xvfb_screen0"
     server.kill()
@@ -197,6 +203,36 @@ def test_display_gone(screen):
                 device.show(flat_pattern(9, WIDTH, HEIGHT))
                 time.sleep(0.05)
         assert time.monotonic() - start < 6.0
+
+
+def test_display_gone_in_the_middle_of_a_scan(screen, tmp_path, monkeypatch):
+    from test_scan import HEIGHT as LOW
+    from test_scan import WIDTH as SMALL
+    from test_scan import Cell
+
+    (tmp_path / "cell").mkdir()
+    cell = Cell(tmp_path / "cell")
+    text = cell.path.read_text()
+    section = f'[projector]\nbackend = "window"\nx = {X}\nwidth = {SMALL}\nheight = {LOW}\nlatency_s = 0.0\n'
+    cell.path.write_text(text[: text.index("[projector]")] + section + text[text.index("[scan]") :])
+
+    def pull_the_plug(what):
+        if what == "taking artefact-2":
+            screen[0].kill()
+            screen[0].wait()
+
+    with cell.controller:
+        with pytest.raises(DeviceError, match=r"gone|display"):
+            cell.scan(tell=pull_the_plug)
+        assert cell.kept() == ["artefact-1"]
+        other, name = start_screen(tmp_path)
+        try:
+            monkeypatch.setenv("DISPLAY", name)
+            assert cell.scan(resume=True).whole == 3
+        finally:
+            other.kill()
+            other.wait()
+        cell.assert_whole()
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])

@@ -215,6 +215,8 @@ def test_the_guard_band(value, verdict):
         ("pf_mm = nan", "pf_mm: "),
         ("pf_mm = inf", "pf_mm: "),
         ('pf_mm = "0.1 mm"', "pf_mm: "),
+        ("pf_mm = true", "pf_mm: "),
+        ("verification = 3", "verification: should be an object"),
         ("share = 0.5", "share: should be greater than or equal to 0.95"),
         ("validity_days = -3", "validity_days: should be greater than 0"),
         ("[positions]\nsd = 0", "positions.sd: should be greater than or equal to 1"),
@@ -420,6 +422,13 @@ def test_the_interval_of_a_drift_holds_what_it_says():
     assert abs(inside / 2000 - 0.95) < 5 * math.sqrt(0.95 * 0.05 / 2000)
 
 
+def test_a_session_evaluated_again_counts_once(tmp_path):
+    path = tmp_path / "verification.jsonl"
+    for day in (-300, -200, -200, -200, 0):
+        append_history(path, made_up(day=day))
+    assert len(with_drift(made_up(), read_history(path)).drift[0].dates) == 3
+
+
 def test_drift_is_of_this_scanner_alone(tmp_path):
     path = tmp_path / "verification.jsonl"
     for day, scanner in ((-300, "s1"), (-200, "s1"), (-100, "s2")):
@@ -567,6 +576,14 @@ def test_a_shot_that_does_not_show_its_standard_does_not_pass(session, tmp_path)
     assert [name for name, _ in other.lost] == ["artefact-2"] and "spheres" in other.lost[0][1]
     assert other["PF"].positions >= 10 and other["PF"].verdict is Verdict.NOT_MEASURED
     assert other["F"].verdict is Verdict.PASS and other.verdict is Verdict.NOT_MEASURED
+
+
+def test_a_small_plane_does_not_test_the_volume(tmp_path):
+    cell = replace(CELL, artefact_shots=1, part_at_deg=(), plane_shots=6, flat_mm=(56.0, 50.0, 10.0))
+    simulate_session(tmp_path / "small", cell)
+    other = verify(tmp_path / "small", {"f_mm": 1.0})
+    assert other["F"].verdict is Verdict.NOT_MEASURED and "quarter of the field" in other["F"].reason
+    assert len(other.lost) == 6
 
 
 def test_a_session_without_a_robot_and_without_touched_centres(session, found, tmp_path):

@@ -456,6 +456,8 @@ class PlaneError:
     """Share of the pixels within the plane's outline that were measured."""
     size_mm: tuple[float, float]
     """Of the rectangle that was seen."""
+    of_field: float
+    """Its longer side as a share of the field's diagonal at that distance."""
     residual_mm: Floats
     """(rows, columns) mean residuals in the image's orientation, NaN where there are none."""
 

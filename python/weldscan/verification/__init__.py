@@ -67,6 +67,8 @@ SAME_PLACE = 0.1
 BALL_FORM_MM = 0.0025
 BALL_DIAMETER_U_MM = 0.005
 PLANE_FLATNESS_MM = 0.005
+# VDI/VDE 2634 part 2, from memory: the plane's length as a share of the volume's diagonal.
+HALF_FIELD = 0.5
 CLOCK_SKEW = timedelta(minutes=10)
 
 
@@ -264,7 +266,7 @@ def verify(
         points = read(shot).points_mm
         try:
             if shot.of == "plane":
-                planes.append(plane_error(shot.name, points, session.plane, kept.share))
+                planes.append(plane_error(shot.name, points, lens, session.plane, kept.share))
             else:
                 assert session.artefact is not None  # the session's models see to it
                 pose = None if shot.flange_pose is None else base_from_flange(shot)
@@ -279,6 +281,11 @@ def verify(
         raise PlateMismatch(f"{where}: {mistaken}")
     lost.update({name: why for name, why in broken.items() if name not in lost})
     characteristics, assumed = _characteristics(session, kept, balls, spacings, planes, lost)
+    short = min((plane.of_field for plane in planes), default=1.0)
+    if short < HALF_FIELD:
+        read.warnings.append(
+            f"a plane spans {100 * short:.0f} % of the field's diagonal: VDI/VDE 2634-2 asks for half (unverified)"
+        )
     valid_until = recorded + timedelta(days=kept.validity_days)
     return Verification(
         session=session.name,

@@ -303,7 +303,10 @@ def _record(found: Verification, prev: str | None) -> Record:
 
 def with_drift(found: Verification, history: History) -> Verification:
     """The verification with the drift of its scanner over the history and itself."""
-    records = [r for r in history.of(found.scanner) if r.session_sha256 != found.software.get("session_sha256")]
+    # A session that was evaluated again is no other state of the scanner: its last evaluation stands for it.
+    by_session = {record.session_sha256: record for record in history.of(found.scanner)}
+    by_session.pop(found.software.get("session_sha256", ""), None)
+    records = list(by_session.values())
     notes = list(history.notes)
     if history.broken is not None:
         notes.append(f"{history.path}: cannot be relied upon: {history.broken}")

@@ -14,8 +14,8 @@ from weldscan.errors import InputError
 from weldscan.session import explain, read_text
 
 # No scanner of a hand's or an arm's reach has a limit of centimetres: those are micrometres.
-Limit = Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1, le=1000)]
+Limit = Annotated[float, Field(gt=0, le=5, allow_inf_nan=False, strict=True)]
+Count = Annotated[int, Field(ge=1, le=1000, strict=True)]
 
 
 class Positions(BaseModel):
@@ -46,12 +46,12 @@ class VerificationLimits(BaseModel):
     ps_mm: Limit | None = None
     sd_mm: Limit | None = None
     f_mm: Limit | None = None
-    share: Annotated[float, Field(ge=0.95, le=1)] = 1.0
+    share: Annotated[float, Field(ge=0.95, le=1, strict=True)] = 1.0
     """Share of the points that PF, PS and F are about: 1 (all), 0.997 (VDI/VDE 2634), 0.95 (ISO 10360-13)."""
     decision: Literal["guarded", "simple"] = "guarded"
     """`guarded`: ISO 14253-1, the test value uncertainty is taken off the limit. `simple`: the limit as it stands."""
     positions: Positions = Positions()
-    validity_days: Annotated[float, Field(gt=0, le=3660)] = 365
+    validity_days: Annotated[float, Field(gt=0, le=3660, strict=True)] = 365
     history: Annotated[str, Field(min_length=1)] | None = None
     """The history file, relative to the configuration's folder."""
 

@@ -149,7 +149,7 @@ def decode_gray(
     black: ArrayLike | None = None,
     inverse: Sequence[ArrayLike] | NDArray[Any] | None = None,
     wrapped: ArrayLike | None = None,
-    contrast: float = 10.0,
+    contrast: float | None = None,
 ) -> NDArray[Any]: ...
 
 # triangulate
@@ -462,7 +462,7 @@ class WeldShot:
     def deviation_mm(self) -> NDArray[np.float32]: ...
 
 def segment_weld(
-    points_mm: NDArray[np.float64],
+    points_mm: ArrayLike,
     radius_mm: float,
     wall_thickness_mm: float,
     axis: Sequence[float] | None = None,

@@ -72,6 +72,12 @@ fn to_cloud(points: &[[f64; 3]], tree: &KdTree, normals: Option<&[[f64; 3]]>, si
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
 fn to_surface(surface: &Surface, signed: bool, points: &[[f64; 3]], distance: &mut [f64]) {
+    plain_to_surface(surface, signed, points, distance);
+}
+
+/// The body of [`to_surface`], and its fallback.
+#[inline(always)]
+fn plain_to_surface(surface: &Surface, signed: bool, points: &[[f64; 3]], distance: &mut [f64]) {
     // The match is outside of the loops, so that each of them is one formula for the vector unit.
     match surface {
         Surface::Plane(s) => each(points, distance, signed, |p| s.distance(p)),
@@ -324,6 +330,22 @@ mod tests {
                 // The foot lies on the surface, straight below the point.
                 assert!(surface.foot(&foot.point).distance.abs() < ROUNDED);
                 assert!((foot.point + foot.normal * foot.distance - Vec3::from(*q)).norm() < ROUNDED);
+            }
+        }
+    }
+
+    #[test]
+    fn vectors_and_the_plain_fallback_give_the_same_bits() {
+        for surface in [
+            Surface::Plane(Plane::new([1.0, 2.0, 3.0], [1.0, -2.0, 0.5]).unwrap()),
+            Surface::Sphere(Sphere::new([1.0, 2.0, 3.0], 7.0).unwrap()),
+            Surface::Cylinder(Cylinder::new([1.0, 2.0, 3.0], [0.0, 3.0, 4.0], 7.0).unwrap()),
+        ] {
+            for signed in [true, false] {
+                let (mut fast, mut plain) = (vec![0.0; 5000], vec![0.0; 5000]);
+                to_surface(&surface, signed, &queries(), &mut fast);
+                plain_to_surface(&surface, signed, &queries(), &mut plain);
+                assert_eq!(fast, plain);
             }
         }
     }

@@ -518,6 +518,19 @@ fn to_cloud(
     steps: &mut [Step],
     matches: &mut [Match],
 ) {
+    plain_to_cloud(tree, normals, pose, source, steps, matches);
+}
+
+/// The body of [`to_cloud`], and its fallback.
+#[inline(always)]
+fn plain_to_cloud(
+    tree: &KdTree,
+    normals: Option<&[[f64; 3]]>,
+    pose: &Transform,
+    source: &[[f64; 3]],
+    steps: &mut [Step],
+    matches: &mut [Match],
+) {
     let mut aside = Aside::new();
     for ((p, step), found) in source.iter().zip(steps).zip(matches) {
         let moved = pose.apply(&as_vector(p));
@@ -541,6 +554,12 @@ fn to_mesh(mesh: &Mesh, pose: &Transform, source: &[[f64; 3]], matches: &mut [Ma
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
 fn to_surface(surface: &Surface, pose: &Transform, source: &[[f64; 3]], matches: &mut [Match]) {
+    plain_to_surface(surface, pose, source, matches);
+}
+
+/// The body of [`to_surface`], and its fallback.
+#[inline(always)]
+fn plain_to_surface(surface: &Surface, pose: &Transform, source: &[[f64; 3]], matches: &mut [Match]) {
     for (p, found) in source.iter().zip(matches) {
         let foot = surface.foot(&pose.apply(&as_vector(p)));
         *found = Match { point: foot.point, normal: foot.normal, distance: foot.distance.abs() };
@@ -549,6 +568,12 @@ fn to_surface(surface: &Surface, pose: &Transform, source: &[[f64; 3]], matches:
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
 fn accumulate(setting: &Setting, source: &[[f64; 3]], matches: &[Match]) -> Equations {
+    plain_accumulate(setting, source, matches)
+}
+
+/// The body of [`accumulate`], and its fallback.
+#[inline(always)]
+fn plain_accumulate(setting: &Setting, source: &[[f64; 3]], matches: &[Match]) -> Equations {
     let mut all = Equations::default();
     for (p, m) in source.iter().zip(matches) {
         if m.distance > setting.limit {
@@ -798,6 +823,32 @@ mod tests {
         assert!(error(Options { kernel: Kernel::Tukey(None), ..Options::default() }) < 1e-6);
         assert!(error(Options { kernel: Kernel::Tukey(Some(0.5)), ..Options::default() }) < 1e-6);
         assert!(error(Options { kernel: Kernel::Huber(Some(0.01)), ..Options::default() }) < 0.01);
+    }
+
+    #[test]
+    fn vectors_and_the_plain_fallback_give_the_same_bits() {
+        let (target, normals) = relief(60);
+        let tree = KdTree::new(&target).unwrap();
+        let (pose, n) = (pose([0.02, 0.01, -0.01], [0.3, 0.2, -0.1]), target.len());
+        let (mut fast, mut plain) = (vec![Match::default(); n], vec![Match::default(); n]);
+        let (mut fast_steps, mut plain_steps) = (vec![Step::NEW; n], vec![Step::NEW; n]);
+        to_cloud(&tree, Some(&normals), &pose, &target, &mut fast_steps, &mut fast);
+        plain_to_cloud(&tree, Some(&normals), &pose, &target, &mut plain_steps, &mut plain);
+        let numbers = |m: &[Match]| m.iter().map(|m| (m.point, m.normal, m.distance.to_bits())).collect::<Vec<_>>();
+        assert_eq!(numbers(&fast), numbers(&plain));
+        for metric in [Metric::Point, Metric::Plane] {
+            for kernel in [Kernel::None, Kernel::Huber(Some(0.1)), Kernel::Tukey(Some(0.3))] {
+                let center = Vec3::new(30.0, 30.0, 0.0);
+                let setting = Setting { pose, center, size: 25.0, limit: 0.5, metric, kernel };
+                let (a, b) = (accumulate(&setting, &target, &fast), plain_accumulate(&setting, &target, &fast));
+                assert!(a.sums == b.sums && a.squares == b.squares && a.plain == b.plain && a.count == b.count);
+                assert!(a.count > n / 2);
+            }
+        }
+        let surface = Surface::Cylinder(Cylinder::new([0.0; 3], [0.0, 1.0, 2.0], 20.0).unwrap());
+        to_surface(&surface, &pose, &target, &mut fast);
+        plain_to_surface(&surface, &pose, &target, &mut plain);
+        assert_eq!(numbers(&fast), numbers(&plain));
     }
 
     #[test]

@@ -341,6 +341,18 @@ impl Visit for NearestFace<'_> {
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
 fn feet_of<T>(mesh: &Mesh, points: &[[f64; 3]], signed: bool, out: &mut [T], put: &(impl Fn(&mut T, Foot) + Sync)) {
+    plain_feet_of(mesh, points, signed, out, put);
+}
+
+/// The body of [`feet_of`], and its fallback.
+#[inline(always)]
+fn plain_feet_of<T>(
+    mesh: &Mesh,
+    points: &[[f64; 3]],
+    signed: bool,
+    out: &mut [T],
+    put: &(impl Fn(&mut T, Foot) + Sync),
+) {
     let mut aside = Aside::new();
     for (p, out) in points.iter().zip(out) {
         let mut found = NearestFace { leaves: &mesh.leaves, q: *p, squared: f64::MAX, face: 0 };
@@ -433,6 +445,19 @@ pub(crate) mod tests {
             );
             assert!(((foot.point - Vec3::from(*q)).norm() - foot.distance).abs() < 1e-12);
         }
+    }
+
+    #[test]
+    fn vectors_and_the_plain_fallback_give_the_same_bits() {
+        let (vertices, triangles) = tube(64, 10.0, 30.0);
+        let mesh = Mesh::new(&vertices, &triangles).unwrap();
+        let queries = random(2000, 3, 60.0);
+        let put = |out: &mut Foot, foot: Foot| *out = foot;
+        let none = Foot { distance: 0.0, point: Vec3::zeros(), normal: Vec3::zeros() };
+        let (mut fast, mut plain) = (vec![none; 2000], vec![none; 2000]);
+        feet_of(&mesh, &queries, true, &mut fast, &put);
+        plain_feet_of(&mesh, &queries, true, &mut plain, &put);
+        assert!(fast == plain && fast.iter().any(|f| f.distance < 0.0) && fast.iter().any(|f| f.distance > 0.0));
     }
 
     #[test]

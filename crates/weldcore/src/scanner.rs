@@ -122,11 +122,26 @@ impl Lens {
         None
     }
 
+    /// [`Self::project`] of many points; NaN where there is no pixel.
+    pub fn project_all(&self, points: &[[f64; 3]]) -> Vec<[f64; 2]> {
+        pairs(points, |p| self.project(&Vec3::from(*p)))
+    }
+
+    /// [`Self::undistort`] of many pixels; NaN where there is no direction.
+    pub fn undistort_all(&self, pixels: &[[f64; 2]]) -> Vec<[f64; 2]> {
+        pairs(pixels, |&[u, v]| self.undistort(u, v))
+    }
+
     /// Whether pixel (u, v) lies in the image, borders of the outer pixels included.
     #[inline]
     pub fn contains(&self, u: f64, v: f64) -> bool {
         u >= -0.5 && v >= -0.5 && u <= self.width as f64 - 0.5 && v <= self.height as f64 - 0.5
     }
+}
+
+fn pairs<T: Sync>(items: &[T], of: impl Fn(&T) -> Option<(f64, f64)> + Sync) -> Vec<[f64; 2]> {
+    let pair = |item: &T| of(item).map_or([f64::NAN; 2], |(a, b)| [a, b]);
+    threads::map_chunks(items, |_, chunk| chunk.iter().map(pair).collect::<Vec<_>>()).concat()
 }
 
 /// The direction of every pixel of a camera: x and y of (x, y, 1), row-major; NaN where the lens has none.
@@ -184,6 +199,12 @@ impl Scanner {
             return Err(Error::Degenerate { what: "scanner", reason });
         }
         Ok(Self::bare(camera, projector, camera_from_projector))
+    }
+
+    /// The projector pixels that light points of the camera's frame; NaN where there is none.
+    pub fn project_to_projector(&self, points: &[[f64; 3]]) -> Vec<[f64; 2]> {
+        let projector_from_camera = self.camera_from_projector.inverse();
+        pairs(points, |p| self.projector.project(&projector_from_camera.apply(&Vec3::from(*p))))
     }
 
     /// The direction of every camera pixel; computed once and kept, for a scan asks for it with every shot.

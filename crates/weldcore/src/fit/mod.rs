@@ -247,6 +247,17 @@ fn accumulate<const P: usize, M: Model<P>>(
     weights: Option<&[f64]>,
     local: Local,
 ) -> Normal<P> {
+    plain_accumulate(model, points, weights, local)
+}
+
+/// The body of [`accumulate`], and its fallback.
+#[inline(always)]
+fn plain_accumulate<const P: usize, M: Model<P>>(
+    model: &M,
+    points: &[[f64; 3]],
+    weights: Option<&[f64]>,
+    local: Local,
+) -> Normal<P> {
     let zero = Lanes([0.0; LANES]);
     let (mut matrix, mut gradient) = ([[zero; P]; P], [zero; P]);
     let (mut cost, mut weight) = (zero, zero);
@@ -606,6 +617,20 @@ mod tests {
             for width in [None, Some(2)] {
                 let _ = spheres::find(&points, width, r, None);
             }
+        }
+    }
+
+    #[test]
+    fn vectors_and_the_plain_fallback_give_the_same_bits() {
+        let points = cap(1003, [0.1, 0.2, 0.3], 1.1, 2.0, 0.1);
+        let weights: Vec<f64> = (0..1003).map(|i| 0.5 + (i % 3) as f64).collect();
+        let model = sphere::Unknown { center: [0.1, 0.2, 0.3], radius: 1.2 };
+        for weights in [None, Some(weights.as_slice())] {
+            let local = Local::new(Vec3::zeros(), 1.0);
+            let fast: Normal<4> = accumulate(&model, &points, weights, local);
+            let plain: Normal<4> = plain_accumulate(&model, &points, weights, local);
+            assert!(fast.matrix == plain.matrix && fast.gradient == plain.gradient);
+            assert!(fast.cost == plain.cost && fast.weight == plain.weight && fast.cost > 0.0);
         }
     }
 

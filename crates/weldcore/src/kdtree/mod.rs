@@ -498,6 +498,12 @@ impl Found for WithinRadius {
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
 fn nearest_of(tree: &KdTree, queries: &[[f64; 3]], found: &mut [Nearest]) {
+    plain_nearest_of(tree, queries, found);
+}
+
+/// The body of [`nearest_of`], and its fallback.
+#[inline(always)]
+fn plain_nearest_of(tree: &KdTree, queries: &[[f64; 3]], found: &mut [Nearest]) {
     let mut aside = Aside::new();
     for (q, found) in queries.iter().zip(found) {
         tree.offer_leaf(tree.boxes.dive(q), q, found);
@@ -507,6 +513,12 @@ fn nearest_of(tree: &KdTree, queries: &[[f64; 3]], found: &mut [Nearest]) {
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
 fn signed_of(tree: &KdTree, normals: &[[f64; 3]], queries: &[[f64; 3]], distance: &mut [f64]) {
+    plain_signed_of(tree, normals, queries, distance);
+}
+
+/// The body of [`signed_of`], and its fallback.
+#[inline(always)]
+fn plain_signed_of(tree: &KdTree, normals: &[[f64; 3]], queries: &[[f64; 3]], distance: &mut [f64]) {
     let mut aside = Aside::new();
     for (q, distance) in queries.iter().zip(distance) {
         let mut step = Step::NEW;
@@ -519,6 +531,12 @@ fn signed_of(tree: &KdTree, normals: &[[f64; 3]], queries: &[[f64; 3]], distance
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
 fn follow_all(tree: &KdTree, queries: &[[f64; 3]], steps: &mut [Step], found: &mut [(f64, u32)]) {
+    plain_follow_all(tree, queries, steps, found);
+}
+
+/// The body of [`follow_all`], and its fallback.
+#[inline(always)]
+fn plain_follow_all(tree: &KdTree, queries: &[[f64; 3]], steps: &mut [Step], found: &mut [(f64, u32)]) {
     let mut aside = Aside::new();
     for ((q, step), found) in queries.iter().zip(steps).zip(found) {
         let squared = tree.follow(q, step, &mut aside);
@@ -528,6 +546,12 @@ fn follow_all(tree: &KdTree, queries: &[[f64; 3]], steps: &mut [Step], found: &m
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
 fn nearest_k_of(tree: &KdTree, queries: &[[f64; 3]], k: usize, distance: &mut [f64], index: &mut [u32]) {
+    plain_nearest_k_of(tree, queries, k, distance, index);
+}
+
+/// The body of [`nearest_k_of`], and its fallback.
+#[inline(always)]
+fn plain_nearest_k_of(tree: &KdTree, queries: &[[f64; 3]], k: usize, distance: &mut [f64], index: &mut [u32]) {
     let mut aside = Aside::new();
     for ((q, distance), index) in queries.iter().zip(distance.chunks_mut(k)).zip(index.chunks_mut(k)) {
         distance.fill(FAR);
@@ -541,6 +565,12 @@ fn nearest_k_of(tree: &KdTree, queries: &[[f64; 3]], k: usize, distance: &mut [f
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
 fn within_of(tree: &KdTree, queries: &[[f64; 3]], r: f64) -> Vec<Within> {
+    plain_within_of(tree, queries, r)
+}
+
+/// The body of [`within_of`], and its fallback.
+#[inline(always)]
+fn plain_within_of(tree: &KdTree, queries: &[[f64; 3]], r: f64) -> Vec<Within> {
     let mut aside = Aside::new();
     // Wide enough for the rounding of the square and of the root that decides.
     let bound = (r * r * (1.0 + 4.0 * f64::EPSILON)).clamp(f64::MIN_POSITIVE, FAR);
@@ -639,6 +669,41 @@ mod tests {
                 agrees(&random(n, 1, 100.0, offset), &random(50, 2, 120.0, offset - 10.0), 11, 9.0);
             }
         }
+    }
+
+    #[test]
+    fn vectors_and_the_plain_fallback_give_the_same_bits() {
+        let points = random(5000, 3, 100.0, -50.0);
+        let queries = random(400, 4, 130.0, -65.0);
+        let tree = KdTree::new(&points).unwrap();
+        let n = queries.len();
+        let none = Nearest { squared: FAR, index: u32::MAX };
+        let (mut fast, mut plain) = (vec![none; n], vec![none; n]);
+        nearest_of(&tree, &queries, &mut fast);
+        plain_nearest_of(&tree, &queries, &mut plain);
+        for (a, b) in fast.iter().zip(&plain) {
+            assert_eq!((a.squared.to_bits(), a.index), (b.squared.to_bits(), b.index));
+        }
+        let normals = random(5000, 5, 2.0, -1.0);
+        let (mut fast, mut plain) = (vec![0.0; n], vec![0.0; n]);
+        signed_of(&tree, &normals, &queries, &mut fast);
+        plain_signed_of(&tree, &normals, &queries, &mut plain);
+        assert!(fast == plain && fast.iter().any(|&d| d < 0.0));
+        let (mut fast, mut plain) = (vec![(0.0, 0); n], vec![(0.0, 0); n]);
+        let (mut fast_steps, mut plain_steps) = (vec![Step::NEW; n], vec![Step::NEW; n]);
+        for shift in [0.0, 1e-3, 2.0] {
+            let moved: Vec<[f64; 3]> = queries.iter().map(|q| q.map(|c| c + shift)).collect();
+            follow_all(&tree, &moved, &mut fast_steps, &mut fast);
+            plain_follow_all(&tree, &moved, &mut plain_steps, &mut plain);
+            assert_eq!(fast, plain);
+        }
+        let (mut fast, mut plain) = ((vec![0.0; 7 * n], vec![0; 7 * n]), (vec![0.0; 7 * n], vec![0; 7 * n]));
+        nearest_k_of(&tree, &queries, 7, &mut fast.0, &mut fast.1);
+        plain_nearest_k_of(&tree, &queries, 7, &mut plain.0, &mut plain.1);
+        assert_eq!(fast, plain);
+        let lists = |found: Vec<Within>| found.into_iter().map(|w| (w.distance_mm, w.index)).collect::<Vec<_>>();
+        let (fast, plain) = (within_of(&tree, &queries, 6.0), plain_within_of(&tree, &queries, 6.0));
+        assert_eq!(lists(fast), lists(plain));
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use numpy::{Ix1, IxDyn, PyArray1, PyArray2, PyReadonlyArray2, PyUntypedArrayMethods, ToPyArray};
 use pyo3::prelude::*;
 
-use super::{compute, float_matrix, floats, points as as_points, raise};
+use super::{compute, float_matrix, floats, points as as_points, raise, whole, whole_or_none};
 use crate::Vec3;
 use crate::error::Error;
 use crate::fit::{Fit, Noise, cylinder, plane, robust, sphere, spheres};
@@ -121,7 +121,7 @@ fn find_spheres(
     py: Python<'_>,
     points: &Bound<'_, PyAny>,
     radius_mm: f64,
-    count: Option<usize>,
+    #[pyo3(from_py_with = whole_or_none)] count: Option<usize>,
 ) -> PyResult<Vec<FoundSphere>> {
     let array = floats::<IxDyn>("points", points)?;
     let width = match *array.shape() {
@@ -353,13 +353,13 @@ fn fit_plane(
     weights: Option<&Bound<'_, PyAny>>,
     sigma_mm: Option<f64>,
     robust: bool,
-    seed: u64,
+    #[pyo3(from_py_with = whole)] seed: usize,
 ) -> PyResult<PlaneFit> {
     let array = float_matrix("points", points)?;
     let weights = weights_of(&array, weights, robust)?;
     let (list, weights) = (as_points("points", &array)?, weights.as_ref().map(|w| w.as_slice()).transpose()?);
     if robust {
-        let (fit, inliers) = compute(py, || robust::plane(list, sigma_mm, seed))?;
+        let (fit, inliers) = compute(py, || robust::plane(list, sigma_mm, seed as u64))?;
         return Ok(PlaneFit::of(&fit, Some(inliers)));
     }
     Ok(PlaneFit::of(&compute(py, || plane::fit(list, Noise { weights, sigma_mm }))?, None))
@@ -400,13 +400,13 @@ fn fit_sphere(
     weights: Option<&Bound<'_, PyAny>>,
     sigma_mm: Option<f64>,
     robust: bool,
-    seed: u64,
+    #[pyo3(from_py_with = whole)] seed: usize,
 ) -> PyResult<SphereFit> {
     let array = float_matrix("points", points)?;
     let weights = weights_of(&array, weights, robust)?;
     let (list, weights) = (as_points("points", &array)?, weights.as_ref().map(|w| w.as_slice()).transpose()?);
     if robust {
-        let (fit, inliers) = compute(py, || robust::sphere(list, radius_mm, sigma_mm, seed))?;
+        let (fit, inliers) = compute(py, || robust::sphere(list, radius_mm, sigma_mm, seed as u64))?;
         return Ok(SphereFit::of(&fit, Some(inliers)));
     }
     Ok(SphereFit::of(&compute(py, || sphere::fit(list, radius_mm, Noise { weights, sigma_mm }))?, None))
@@ -450,13 +450,13 @@ fn fit_cylinder(
     weights: Option<&Bound<'_, PyAny>>,
     sigma_mm: Option<f64>,
     robust: bool,
-    seed: u64,
+    #[pyo3(from_py_with = whole)] seed: usize,
 ) -> PyResult<CylinderFit> {
     let array = float_matrix("points", points)?;
     let weights = weights_of(&array, weights, robust)?;
     let (list, weights) = (as_points("points", &array)?, weights.as_ref().map(|w| w.as_slice()).transpose()?);
     if robust {
-        let (fit, inliers) = compute(py, || robust::cylinder(list, radius_mm, sigma_mm, seed))?;
+        let (fit, inliers) = compute(py, || robust::cylinder(list, radius_mm, sigma_mm, seed as u64))?;
         return Ok(CylinderFit::of(&fit, Some(inliers)));
     }
     Ok(CylinderFit::of(&compute(py, || cylinder::fit(list, radius_mm, Noise { weights, sigma_mm }))?, None))

@@ -7,7 +7,7 @@ use pyo3::prelude::*;
 use super::distance::{Given, array, words};
 use super::normals::NEIGHBOURS;
 use super::transform::rows;
-use super::{float_matrix, points, raise, transform};
+use super::{float_matrix, points, raise, transform, whole, whole_or_none};
 use crate::distance::Target;
 use crate::error::Error;
 use crate::icp::{self, Kernel, Kind, Metric, Options, Registration, Weak};
@@ -186,10 +186,10 @@ fn register_icp(
     trim: f64,
     kernel: Option<&str>,
     kernel_mm: Option<f64>,
-    max_iterations: i64,
+    #[pyo3(from_py_with = whole)] max_iterations: usize,
     tolerance_mm: f64,
     weak: f64,
-    max_points: Option<i64>,
+    #[pyo3(from_py_with = whole_or_none)] max_points: Option<usize>,
 ) -> PyResult<PyRegistration> {
     let unknown = |what, expected: &str, value: &str| {
         raise(py, &Error::OutOfRange { what, expected: expected.into(), value: format!("'{value}'") })
@@ -210,8 +210,6 @@ fn register_icp(
         Some(given) => transform("start", &float_matrix("start", given)?)?,
         None => defaults.start,
     };
-    let count = |n: i64| usize::try_from(n).unwrap_or(0);
-    let (max_iterations, max_points) = (count(max_iterations), max_points.map(count));
     let options =
         Options { metric, start, max_distance_mm, trim, kernel, max_iterations, tolerance_mm, weak, max_points };
     let source = float_matrix("source", source)?;

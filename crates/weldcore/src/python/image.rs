@@ -4,7 +4,7 @@ use numpy::PyArray;
 use numpy::ndarray::Array2;
 use pyo3::prelude::*;
 
-use super::{compute, raise_as};
+use super::{Whole, compute, raise_as};
 use crate::image::{self, Pixels};
 
 /// The pixels of a grey PNG of 8 or 16 bits, read strictly: what is truncated, damaged or in colour is refused.
@@ -29,8 +29,8 @@ use crate::image::{self, Pixels};
 ///     weldscan.errors.InputError: is truncated: the PNG breaks off after ... bytes
 #[pyfunction]
 #[pyo3(signature = (data, size=None))]
-fn decode_png<'py>(py: Python<'py>, data: &[u8], size: Option<[usize; 2]>) -> PyResult<Bound<'py, PyAny>> {
-    let image = compute(py, || image::decode_png(data, size))?;
+fn decode_png<'py>(py: Python<'py>, data: &[u8], size: Option<[Whole; 2]>) -> PyResult<Bound<'py, PyAny>> {
+    let image = compute(py, || image::decode_png(data, size.map(|side| side.map(|w| w.0))))?;
     let shape = (image.height, image.width);
     let misfit = |e: numpy::ndarray::ShapeError| raise_as(py, "InputError", e.to_string());
     Ok(match image.pixels {

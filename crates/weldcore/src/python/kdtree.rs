@@ -6,7 +6,7 @@ use numpy::ndarray::Array2;
 use numpy::{IntoPyArray, PyArray1, PyArray2};
 use pyo3::prelude::*;
 
-use super::{compute, float_matrix, points, raise};
+use super::{compute, float_matrix, points, raise, whole};
 use crate::error::Error;
 use crate::kdtree::{Follower, KdTree};
 
@@ -93,12 +93,10 @@ impl PyKdTree {
         &self,
         py: Python<'py>,
         queries: &Bound<'py, PyAny>,
-        k: i64,
+        #[pyo3(from_py_with = whole)] k: usize,
     ) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>)> {
         let array = float_matrix("queries", queries)?;
         let queries = points("queries", &array)?;
-        // A negative k is as wrong as none.
-        let k = usize::try_from(k).unwrap_or(0);
         let (distance, index) = compute(py, || self.tree.knn(queries, k))?;
         let shape = (queries.len(), k);
         let wrong = |e: numpy::ndarray::ShapeError| {

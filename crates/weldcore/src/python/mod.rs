@@ -4,6 +4,7 @@
 //! A room of the core has a file of the same name here with a `register` function.
 
 use numpy::{PyArray, PyArrayMethods, PyReadonlyArray, PyReadonlyArray2, PyUntypedArrayMethods};
+use pyo3::exceptions::PyOverflowError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -94,6 +95,45 @@ pub(crate) fn points<'a>(what: &'static str, array: &'a PyReadonlyArray2<'_, f64
     Ok(flat.as_chunks::<3>().0)
 }
 
+/// A whole number of Python's, of any size and sign. One beyond the range of usize becomes its nearest: the checks of the
+/// range refuse that by name, and a negative number is as wrong as none.
+pub(crate) struct Whole(pub usize);
+
+impl<'a, 'py> FromPyObject<'a, 'py> for Whole {
+    type Error = PyErr;
+
+    fn extract(given: Borrowed<'a, 'py, PyAny>) -> PyResult<Self> {
+        match given.extract() {
+            Ok(number) => Ok(Self(number)),
+            Err(error) if error.is_instance_of::<PyOverflowError>(given.py()) => {
+                Ok(Self(if given.lt(0)? { 0 } else { usize::MAX }))
+            }
+            Err(error) => Err(error),
+        }
+    }
+}
+
+/// [`Whole`] for an argument.
+pub(crate) fn whole(given: &Bound<'_, PyAny>) -> PyResult<usize> {
+    Ok(given.extract::<Whole>()?.0)
+}
+
+/// [`Whole`] for an argument that may be None.
+pub(crate) fn whole_or_none(given: &Bound<'_, PyAny>) -> PyResult<Option<usize>> {
+    Ok(given.extract::<Option<Whole>>()?.map(|w| w.0))
+}
+
+/// An argument of several parts as a `T`; what is none is named, with what it should be.
+pub(crate) fn parts<'py, T>(what: &'static str, expected: &str, given: &Bound<'py, PyAny>) -> PyResult<T>
+where
+    T: for<'a> FromPyObject<'a, 'py, Error = PyErr>,
+{
+    let py = given.py();
+    given.extract().map_err(|e: PyErr| {
+        raise(py, &Error::Shape { what, expected: expected.into(), got: format!("another: {}", e.value(py)) })
+    })
+}
+
 /// A 4x4 array as a rigid transform.
 pub(crate) fn transform(what: &'static str, array: &PyReadonlyArray2<'_, f64>) -> PyResult<Transform> {
     let py = array.py();
@@ -109,7 +149,7 @@ pub(crate) fn transform(what: &'static str, array: &PyReadonlyArray2<'_, f64>) -
 /// Sets how many threads the core uses in this process; None returns to the default.
 #[pyfunction]
 #[pyo3(signature = (threads=None))]
-fn set_threads(py: Python<'_>, threads: Option<usize>) -> PyResult<()> {
+fn set_threads(py: Python<'_>, #[pyo3(from_py_with = whole_or_none)] threads: Option<usize>) -> PyResult<()> {
     crate::threads::set_threads(threads).map_err(|e| raise(py, &e))
 }
 

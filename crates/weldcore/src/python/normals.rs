@@ -5,7 +5,7 @@ use numpy::{IntoPyArray, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
 use super::distance::vector;
-use super::{compute, floats, points, raise};
+use super::{compute, floats, points, raise, whole};
 use crate::error::Error;
 use crate::normals;
 
@@ -45,12 +45,10 @@ fn estimate_normals<'py>(
     py: Python<'py>,
     points: &Bound<'py, PyAny>,
     viewpoint: Option<&Bound<'py, PyAny>>,
-    k: i64,
-    window: i64,
+    #[pyo3(from_py_with = whole)] k: usize,
+    #[pyo3(from_py_with = whole)] window: usize,
 ) -> PyResult<Bound<'py, PyAny>> {
     let viewpoint = viewpoint.map_or(Ok([0.0; 3]), |v| vector("viewpoint", v))?;
-    // A negative number is as wrong as none.
-    let (k, window) = (usize::try_from(k).unwrap_or(0), usize::try_from(window).unwrap_or(0));
     let wrong =
         |got: String| raise(py, &Error::Shape { what: "points", expected: "shape (H, W, 3) or (n, 3)".into(), got });
     let dimensions =

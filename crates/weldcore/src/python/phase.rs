@@ -6,7 +6,7 @@ use numpy::{
 };
 use pyo3::prelude::*;
 
-use super::{compute, float_matrix, floats, raise};
+use super::{Whole, compute, float_matrix, floats, parts, raise, whole};
 use crate::error::Error;
 use crate::phase::{
     DecodeOptions, FringeSet, Level, PhaseMap, Shot, WrappedPhase, decode_phase as decode_phase_core, decode_shot,
@@ -182,8 +182,8 @@ fn decode_as<T: Level + numpy::Element>(
 fn decode(
     py: Python<'_>,
     exposures: &Bound<'_, PyAny>,
-    fringes: Vec<(f64, usize)>,
-    projector_size: usize,
+    fringes: &Bound<'_, PyAny>,
+    #[pyo3(from_py_with = whole)] projector_size: usize,
     saturation: Option<f64>,
     z: f64,
 ) -> PyResult<PyPhaseMap> {
@@ -200,7 +200,9 @@ fn decode(
         let frames: Vec<_> = list(stack.bind(py))?.into_iter().map(|f| f.into_bound(py)).collect();
         stacks.push(frames);
     }
-    let sets: Vec<FringeSet> = fringes.into_iter().map(|(periods, steps)| FringeSet { periods, steps }).collect();
+    let fringes: Vec<(f64, Whole)> = parts("fringes", "a list of (periods, steps)", fringes)?;
+    let sets: Vec<FringeSet> =
+        fringes.into_iter().map(|(periods, steps)| FringeSet { periods, steps: steps.0 }).collect();
     let options = DecodeOptions { saturation, z };
     let wide = stacks.first().and_then(|f| f.first()).is_some_and(|f| f.cast::<PyArray2<u16>>().is_ok());
     if wide {
@@ -296,8 +298,8 @@ fn slices<'a, T: numpy::Element>(arrays: &'a [PyReadonlyArray2<'_, T>]) -> PyRes
 /// The number of steps of each set.
 #[derive(FromPyObject)]
 enum Steps {
-    One(usize),
-    Many(Vec<usize>),
+    One(Whole),
+    Many(Vec<Whole>),
 }
 
 /// The wrapped phase of N-step images: the least-squares sinusoid `A + B cos(phi - 2 pi k/N)` in every pixel.
@@ -328,8 +330,8 @@ enum Steps {
 fn decode_phase(py: Python<'_>, images: &Bound<'_, PyAny>, steps: Steps) -> PyResult<PyWrappedPhase> {
     let (found, [h, w]) = self::images("images", images)?;
     let (sets, one) = match steps {
-        Steps::One(n) => (vec![n], true),
-        Steps::Many(list) => (list, false),
+        Steps::One(n) => (vec![n.0], true),
+        Steps::Many(list) => (list.into_iter().map(|n| n.0).collect(), false),
     };
     let WrappedPhase { phase_rad, modulation, background, residual } = match &found {
         Images::U8(a) => {
@@ -442,8 +444,9 @@ fn unwrap_spatial<'py>(
     quality.as_ref().map_or(Ok(()), |q| same("quality", q.shape()))?;
     let mask: Option<PyReadonlyArray2<'_, bool>> = match mask {
         Some(given) => {
-            let array = py.import("numpy")?.call_method1("ascontiguousarray", (given,))?;
-            let array = array.cast_into::<PyArray2<bool>>().map_err(|_| {
+            let numpy = py.import("numpy")?;
+            let array = numpy.call_method1("ascontiguousarray", (given,)).ok();
+            let array = array.and_then(|a| a.cast_into::<PyArray2<bool>>().ok()).ok_or_else(|| {
                 let expected = "an (H, W) array of bool".into();
                 raise(py, &Error::Shape { what: "mask", expected, got: given.get_type().to_string() })
             })?;
@@ -468,8 +471,10 @@ fn unwrap_spatial<'py>(
 ///     wrapped: (H, W), rad. Then the last bit is the complementary one: it changes at half periods of these fringes, and
 ///         a period's number changes where its phase is zero. Near that place the order is taken from the code with the
 ///         last bit, which does not change there, elsewhere from the code without it.
-///     contrast: least difference (white - black, or image - inverse) in grey levels that tells a bit. Say ten times the
-///         noise of a level.
+///     contrast: least difference (white - black, or image - inverse) in grey levels that tells a bit. None: five
+///         standard deviations of what decides it, the noise taken from the images: between white and black, from how far
+///         the bits' levels are from the nearer one; with inverse images, from the sums of the pairs, which should be
+///         equal (one pair shows no noise: one grey level is assumed).
 ///
 /// Returns:
 ///     (H, W) int32, the code from 0 to 2^bits - 1, -1 where a bit cannot be told; with `wrapped` (H, W) float64, the
@@ -488,14 +493,14 @@ fn unwrap_spatial<'py>(
 ///     >>> decode_gray(images, white=np.full((1, 4), 200, np.uint8), black=np.zeros((1, 4), np.uint8))
 ///     array([[0, 1, 2, 3]], dtype=int32)
 #[pyfunction]
-#[pyo3(signature = (images, *, white=None, black=None, inverse=None, wrapped=None, contrast=10.0))]
+#[pyo3(signature = (images, *, white=None, black=None, inverse=None, wrapped=None, contrast=None))]
 fn decode_gray<'py>(
     images: &Bound<'py, PyAny>,
     white: Option<&Bound<'py, PyAny>>,
     black: Option<&Bound<'py, PyAny>>,
     inverse: Option<&Bound<'py, PyAny>>,
     wrapped: Option<&Bound<'py, PyAny>>,
-    contrast: f64,
+    contrast: Option<f64>,
 ) -> PyResult<Py<PyAny>> {
     let py = images.py();
     let shape = self::images("images", images)?.1;

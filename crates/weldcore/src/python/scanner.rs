@@ -3,8 +3,7 @@
 use numpy::{IntoPyArray, PyArray2, PyArrayMethods, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
-use super::{float_matrix, floats, raise, transform};
-use crate::Vec3;
+use super::{compute, float_matrix, floats, raise, transform, whole};
 use crate::error::Error;
 use crate::scanner::{Lens, Scanner};
 
@@ -34,7 +33,12 @@ impl PyLens {
     #[new]
     #[pyo3(signature = (width, height, K, dist))]
     #[allow(non_snake_case)] // K is the field's name for it.
-    fn new(width: usize, height: usize, K: &Bound<'_, PyAny>, dist: &Bound<'_, PyAny>) -> PyResult<Self> {
+    fn new(
+        #[pyo3(from_py_with = whole)] width: usize,
+        #[pyo3(from_py_with = whole)] height: usize,
+        K: &Bound<'_, PyAny>,
+        dist: &Bound<'_, PyAny>,
+    ) -> PyResult<Self> {
         let py = K.py();
         let shape = |what, expected: &str, got| raise(py, &Error::Shape { what, expected: expected.into(), got });
         let matrix = float_matrix("K", K)?;
@@ -88,7 +92,8 @@ impl PyLens {
     fn project<'py>(&self, points: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let array = float_matrix("points", points)?;
         let points = super::points("points", &array)?;
-        pairs(points.iter().map(|p| self.lens.project(&Vec3::from(*p))), array.py())
+        let pixels = compute(array.py(), || Ok(self.lens.project_all(points)))?;
+        pairs(array.py(), pixels)
     }
 
     /// The directions (n, 2), x and y of (x, y, 1), that are imaged at pixels (n, 2); NaN where there is none.
@@ -98,7 +103,9 @@ impl PyLens {
             let got = format!("shape {:?}", array.shape());
             return Err(raise(array.py(), &Error::Shape { what: "pixels", expected: "shape (n, 2)".into(), got }));
         }
-        pairs(array.as_array().rows().into_iter().map(|r| self.lens.undistort(r[0], r[1])), array.py())
+        let pixels = array.as_slice()?.as_chunks::<2>().0;
+        let directions = compute(array.py(), || Ok(self.lens.undistort_all(pixels)))?;
+        pairs(array.py(), directions)
     }
 
     fn __repr__(&self) -> String {
@@ -111,10 +118,9 @@ impl PyLens {
     }
 }
 
-fn pairs(values: impl Iterator<Item = Option<(f64, f64)>>, py: Python<'_>) -> PyResult<Bound<'_, PyArray2<f64>>> {
-    let flat: Vec<f64> = values.flat_map(|v| v.map_or([f64::NAN; 2], |(a, b)| [a, b])).collect();
-    let rows = flat.len() / 2;
-    flat.into_pyarray(py).reshape([rows, 2])
+fn pairs(py: Python<'_>, values: Vec<[f64; 2]>) -> PyResult<Bound<'_, PyArray2<f64>>> {
+    let rows = values.len();
+    values.into_flattened().into_pyarray(py).reshape([rows, 2])
 }
 
 /// A structured-light scanner: camera, projector, and where the one stands from the other. Points are in the camera's
@@ -182,10 +188,9 @@ impl PyScanner {
     /// The projector pixels (n, 2) that light points (n, 3) of the scanner's frame, mm; NaN where there is none.
     fn project_to_projector<'py>(&self, points: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let array = float_matrix("points", points)?;
-        let projector_from_camera = self.scanner.camera_from_projector.inverse();
-        let lens = self.scanner.projector;
         let points = super::points("points", &array)?;
-        pairs(points.iter().map(|p| lens.project(&projector_from_camera.apply(&Vec3::from(*p)))), array.py())
+        let pixels = compute(array.py(), || Ok(self.scanner.project_to_projector(points)))?;
+        pairs(array.py(), pixels)
     }
 
     fn __repr__(&self) -> String {

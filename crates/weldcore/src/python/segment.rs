@@ -1,13 +1,14 @@
 //! Segmentation and step for Python: the two calls of `weldscan.inspection`.
 
 use numpy::{
-    IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
-    PyReadonlyArrayDyn, PyUntypedArrayMethods,
+    IntoPyArray, Ix3, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArrayDyn,
+    PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use super::{compute, raise};
+use super::distance::vector;
+use super::{Whole, compute, floats, parts, raise};
 use crate::Vec3;
 use crate::error::Error;
 use crate::place::{self, Scan};
@@ -81,8 +82,9 @@ impl WeldShot {
     }
 }
 
-fn direction(py: Python<'_>, what: &'static str, v: Option<[f64; 3]>) -> PyResult<Option<Vec3>> {
-    let Some(v) = v.map(Vec3::from) else { return Ok(None) };
+fn direction(py: Python<'_>, what: &'static str, given: Option<&Bound<'_, PyAny>>) -> PyResult<Option<Vec3>> {
+    let Some(given) = given else { return Ok(None) };
+    let v = Vec3::from(vector(what, given)?);
     match v.try_normalize(0.0).filter(|u| u.iter().all(|c| c.is_finite())) {
         Some(u) => Ok(Some(u)),
         None => Err(raise(py, &Error::Degenerate { what, reason: "it has no direction".into() })),
@@ -100,15 +102,16 @@ fn direction(py: Python<'_>, what: &'static str, v: Option<[f64; 3]>) -> PyResul
 #[pyo3(signature = (points_mm, radius_mm, wall_thickness_mm, axis=None, zero=None))]
 fn segment_weld(
     py: Python<'_>,
-    points_mm: PyReadonlyArray3<'_, f64>,
+    points_mm: &Bound<'_, PyAny>,
     radius_mm: f64,
     wall_thickness_mm: f64,
-    axis: Option<[f64; 3]>,
-    zero: Option<[f64; 3]>,
+    axis: Option<&Bound<'_, PyAny>>,
+    zero: Option<&Bound<'_, PyAny>>,
 ) -> PyResult<WeldShot> {
+    let points_mm = floats::<Ix3>("points_mm", points_mm)?;
     let shape = points_mm.shape().to_vec();
     let wrong = |got: String| {
-        let expected = "a C-contiguous float64 array of shape (H, W, 3)".into();
+        let expected = "an array of shape (H, W, 3)".into();
         raise(py, &Error::Shape { what: "points_mm", expected, got })
     };
     if shape[2] != 3 {
@@ -215,7 +218,9 @@ type PlacedArrays<'py> = (
 /// angle_deg float32 in [0, 360), axial_mm float32, shot uint16. Raises InputError for arrays that do not belong together.
 /// Source: `crates/weldcore/src/place.rs`.
 #[pyfunction]
-fn place_shots<'py>(py: Python<'py>, shots: Vec<PlacedShot<'py>>) -> PyResult<PlacedArrays<'py>> {
+fn place_shots<'py>(py: Python<'py>, shots: &Bound<'py, PyAny>) -> PyResult<PlacedArrays<'py>> {
+    let expected = "a list of (WeldShot, points_mm, base_from_scanner, deviation_mm, number)";
+    let shots: Vec<PlacedShot<'py>> = parts("shots", expected, shots)?;
     let mut scans = Vec::with_capacity(shots.len());
     for (shot, points, base_from_scanner, deviation, number) in &shots {
         let wrong =
@@ -226,7 +231,10 @@ fn place_shots<'py>(py: Python<'py>, shots: Vec<PlacedShot<'py>>) -> PyResult<Pl
             unrolled: &shot.0.unrolled,
             labels: &shot.0.labels,
             deviation_mm: deviation.as_slice().map_err(wrong)?,
-            shot: *number,
+            shot: u16::try_from(number.0).map_err(|_| {
+                let expected = "0 to 65535".into();
+                raise(py, &Error::OutOfRange { what: "number of a shot", expected, value: number.0.to_string() })
+            })?,
         });
     }
     let placed = compute(py, || place::place(&scans))?;
@@ -242,7 +250,7 @@ fn place_shots<'py>(py: Python<'py>, shots: Vec<PlacedShot<'py>>) -> PyResult<Pl
 }
 
 type PlacedShot<'py> =
-    (PyRef<'py, WeldShot>, PyReadonlyArrayDyn<'py, f64>, PyReadonlyArray2<'py, f64>, PyReadonlyArray1<'py, f32>, u16);
+    (PyRef<'py, WeldShot>, PyReadonlyArrayDyn<'py, f64>, PyReadonlyArray2<'py, f64>, PyReadonlyArray1<'py, f32>, Whole);
 
 pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<WeldShot>()?;

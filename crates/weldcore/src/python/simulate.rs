@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
-use pyo3::exceptions::{PyAttributeError, PyTypeError};
+use pyo3::exceptions::{PyAttributeError, PyOverflowError, PyTypeError};
 use pyo3::prelude::*;
 
 use super::scanner::PyScanner;
-use super::{compute, float_matrix, floats, raise, raise_as, transform};
+use super::{Whole, compute, float_matrix, floats, parts, raise, raise_as, transform, whole};
 use crate::error::Error;
 use crate::scanner::Rays;
 use crate::simulate::{
@@ -114,7 +114,9 @@ fn body(object: &Bound<'_, PyAny>) -> PyResult<Body> {
 
 /// An object that lacks an attribute, or has one of the wrong type, is a wrong input.
 fn wrong_object(py: Python<'_>, what: &str, error: PyErr) -> PyErr {
-    let wrong = error.is_instance_of::<PyAttributeError>(py) || error.is_instance_of::<PyTypeError>(py);
+    let wrong = error.is_instance_of::<PyAttributeError>(py)
+        || error.is_instance_of::<PyTypeError>(py)
+        || error.is_instance_of::<PyOverflowError>(py);
     if wrong { raise_as(py, "InputError", format!("{what}: {}", error.value(py))) } else { error }
 }
 
@@ -195,8 +197,17 @@ impl PyShot {
     /// Raises:
     ///     InputError: the picture is not of the projector's size, the exposure is not above zero.
     #[pyo3(signature = (picture, *, exposure=1.0, number=0))]
-    fn capture(&self, picture: PyReadonlyArray2<'_, u8>, exposure: f64, number: u32) -> PyResult<Py<PyAny>> {
+    fn capture(
+        &self,
+        picture: PyReadonlyArray2<'_, u8>,
+        exposure: f64,
+        #[pyo3(from_py_with = whole)] number: usize,
+    ) -> PyResult<Py<PyAny>> {
         let py = picture.py();
+        let number = u32::try_from(number).map_err(|_| {
+            let expected = "0 to 2^32 - 1".into();
+            raise(py, &Error::OutOfRange { what: "number", expected, value: number.to_string() })
+        })?;
         let pixels: Vec<u8> = picture.as_array().iter().copied().collect();
         match compute(py, || self.shot.capture(&pixels, exposure, number))? {
             Frames::Eight(frames) => array(py, frames.concat(), self.height, self.width),
@@ -243,10 +254,10 @@ fn simulate_shot(
     scanner: &Bound<'_, PyScanner>,
     scene_from_scanner: &Bound<'_, PyAny>,
     bodies: Vec<Bound<'_, PyAny>>,
-    fringes: Vec<(String, f64, usize)>,
-    photometry: PyPhotometry,
+    fringes: &Bound<'_, PyAny>,
+    photometry: &Bound<'_, PyAny>,
     exposures: Vec<f64>,
-    seed: u64,
+    #[pyo3(from_py_with = whole)] seed: usize,
 ) -> PyResult<PyShot> {
     let py = scanner.py();
     let pose: Transform = transform("scene_from_scanner", &float_matrix("scene_from_scanner", scene_from_scanner)?)?;
@@ -263,11 +274,12 @@ fn simulate_shot(
             Err(raise(py, &Error::OutOfRange { what: "fringe axis", expected: "\"x\" or \"y\"".into(), value }))
         }
     };
+    let fringes: Vec<(String, f64, Whole)> = parts("fringes", "a list of (axis, periods, steps)", fringes)?;
     let fringes = fringes
         .into_iter()
-        .map(|(name, periods, steps)| Ok(FringeSet { axis: axis(&name)?, periods, steps }))
+        .map(|(name, periods, steps)| Ok(FringeSet { axis: axis(&name)?, periods, steps: steps.0 }))
         .collect::<PyResult<Vec<_>>>()?;
-    let p = photometry;
+    let p: PyPhotometry = photometry.extract().map_err(|e| wrong_object(py, "photometry", e))?;
     let photometry = Photometry {
         lamp: p.lamp,
         distance_mm: p.distance_mm,
@@ -278,7 +290,7 @@ fn simulate_shot(
         full_well_e: p.full_well_e,
         read_noise_e: p.read_noise_e,
         bits: p.bits,
-        seed,
+        seed: seed as u64,
     };
     let scanner = &scanner.get().scanner;
     let (mut shot, rays) = compute(py, || {
@@ -329,8 +341,8 @@ fn simulated_step<'py>(weld: &Bound<'py, PyAny>, along: &Bound<'py, PyAny>) -> P
     if let Some(index) = along.as_array().iter().position(|a| !a.is_finite()) {
         return Err(raise(py, &Error::NonFinite { what: "along", index }));
     }
-    let steps: Vec<f64> = along.as_array().iter().map(|&a| weld.step_at_seam(a)).collect();
-    Ok(steps.into_pyarray(py))
+    let along = along.as_slice()?;
+    Ok(compute(py, || Ok(weld.steps_at_seam(along)))?.into_pyarray(py))
 }
 
 pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {

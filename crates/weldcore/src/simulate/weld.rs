@@ -5,6 +5,7 @@ use std::f64::consts::TAU;
 
 use crate::Vec3;
 use crate::error::{Error, Result, require_positive};
+use crate::threads;
 
 use super::shapes::{Hit, Ray, entry, smooth_noise};
 
@@ -455,11 +456,20 @@ impl Weld {
             let mut r = start;
             for _ in 0..30 {
                 let (height, gradient) = wall.height(&(base + outward * r));
+                let before = r;
                 r -= height / gradient.dot(&outward);
+                if r == before {
+                    break;
+                }
             }
             r
         };
         surface(other) - surface(reference)
+    }
+
+    /// [`Self::step_at_seam`] at many places.
+    pub fn steps_at_seam(&self, along: &[f64]) -> Vec<f64> {
+        threads::map_chunks(along, |_, chunk| chunk.iter().map(|&a| self.step_at_seam(a)).collect::<Vec<_>>()).concat()
     }
 
     /// Noise of -1 to 1 on the surface, smooth over these lengths along and across the seam.

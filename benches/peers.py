@@ -1,7 +1,7 @@
 """Speed beside what a user would pick instead: asserts that the results agree, then prints one table of ratios.
 
     pip install "weldscan[peers]"        # nothing is installed from here
-    python benches/peers.py [--only WORD] [--pairs N]
+    python benches/peers.py [--only WORD] [--pairs N] [--write]
 
 Both sides run in one process, one after the other, in pairs; the ratio is the median of the pairs' ratios. Peers use
 all threads. A peer that is not installed is named and skipped.
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import platform
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ from dataclasses import dataclass
 from importlib import import_module, metadata
 from typing import Any
 
+import growth
 import numpy as np
 
 import weldscan as ws
@@ -390,10 +390,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="jobs with this word in their name, or suites")
     parser.add_argument("--pairs", type=int, default=7, help="pairs of runs at most")
+    parser.add_argument("--write", action="store_true", help="the table into docs/benchmarks.md, too")
     options = parser.parse_args()
-    print(f"weldscan {ws.__version__}, Python {platform.python_version()}, {platform.machine()}, {THREADS} threads\n")
-    print("| job | peer | peer, s | ours, s | ratio | wanted |")
-    print("|---|---|---:|---:|---:|---:|")
+    said = []
+
+    def say(line: str) -> None:
+        said.append(line)
+        print(line, flush=True)
+
+    say(f"{growth.machine()}; {THREADS} threads.\n")
+    say("| job | peer | peer, s | ours, s | ratio | wanted |")
+    say("|---|---|---:|---:|---:|---:|")
     for suite in SUITES:
         try:
             for job in suite():
@@ -404,9 +411,11 @@ def main() -> None:
                     row = f"{theirs:.4f} | {ours:.4f} | {ratio:.1f} | {job.target:g}"
                 except AssertionError as error:
                     row = f"- | - | results differ: {error} | {job.target:g}"
-                print(f"| {job.name} | {version(job.peer)} | {row} |", flush=True)
+                say(f"| {job.name} | {version(job.peer)} | {row} |")
         except ImportError as error:
-            print(f"| {suite.__name__} | {error.name} is not installed: skipped | | | | |", flush=True)
+            say(f"| {suite.__name__} | {error.name} is not installed: skipped | | | | |")
+    if options.write:
+        growth.rewrite("peers.py", "\n".join(said))
 
 
 if __name__ == "__main__":

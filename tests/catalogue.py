@@ -183,13 +183,17 @@ def _(scale: float) -> Job:
 @job("fit_cylinder")
 def _(scale: float) -> Job:
     points = tube(round(60_000 * scale))
-    return lambda: (ws.fit_cylinder(points), ws.fit_cylinder(points, 50.0), ws.fit_cylinder(strays(points), robust=True))
+    return lambda: (
+        ws.fit_cylinder(points),
+        ws.fit_cylinder(points, 50.0),
+        ws.fit_cylinder(strays(points), robust=True),
+    )
 
 
 @job("find_spheres")
 def _(scale: float) -> Job:
     n = round(20_000 * scale)
-    points = np.vstack([ball(n), ball(n, 1) + [60, 0, 0], cloud(n) * [1, 1, 0.01] + [-100, -100, 350]])
+    points = np.vstack([ball(n), ball(n, 1) + np.array([60, 0, 0]), cloud(n) * [1, 1, 0.01] + [-100, -100, 350]])
     return lambda: ws.find_spheres(points, 20.0)
 
 
@@ -236,16 +240,19 @@ def _(scale: float) -> Job:
 
     def follow() -> Any:
         follower = ws.Follower(tree)
-        return [follower.nearest(queries + [0, 0, shift]) for shift in (0.0, 1e-3, 0.4)]
+        return [follower.nearest(queries + np.array([0, 0, shift])) for shift in (0.0, 1e-3, 0.4)]
 
     return follow
+
+
+OFF = np.array([0.3, -0.2, 0.1])
 
 
 @job("register_icp")
 def _(scale: float) -> Job:
     # More than twice the 16,384 points of the coarse rounds.
-    target, source = cloud(round(60_000 * scale)), cloud(round(40_000 * scale), 1) + [0.3, -0.2, 0.1]
-    tree, pipe_part = ws.KdTree(target), tube(round(20_000 * scale)) + [0.5, 0.5, 0]
+    target, source = cloud(round(60_000 * scale)), cloud(round(40_000 * scale), 1) + OFF
+    tree, pipe_part = ws.KdTree(target), tube(round(20_000 * scale)) + OFF
     mesh = ws.Mesh(*sphere_mesh(20))
     return lambda: (
         ws.register_icp(source, tree, "plane", trim=0.1, max_iterations=8),

@@ -2,8 +2,8 @@
 
     python tests/fuzz.py --inputs 1000000 [--seed 0] [--jobs 2] [--only KdTree.knn] [--first N]
 
-An input is a number: with the seed it decides the function, its arguments and what is wrong with them. Workers compute
-in processes of their own, so that an abort or a hang is a finding like any other; each finding is printed with the number
+An input is a number: with the seed it decides the function, its arguments and what is wrong with them. Workers run in
+processes of their own, so that an abort or a hang is a finding like any other; each finding is printed with the number
 that repeats it (`--first N --inputs 1`). Ends with 1 if there was any.
 """
 
@@ -23,7 +23,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -149,13 +149,13 @@ def registration(rng: Random) -> Arguments:
     at = target(rng)
     out: Arguments = {"source": points(rng), "target": at, "metric": ["point", "plane"][rng.integers(2)]}
     choices = {
-        "start": lambda: pose(rng),
+        "start": partial(pose, rng),
         "max_distance_mm": lambda: 10.0 ** rng.uniform(-2, 3),
-        "trim": lambda: rng.random(),
+        "trim": rng.random,
         "kernel": lambda: ["huber", "tukey"][rng.integers(2)],
         "kernel_mm": lambda: 10.0 ** rng.uniform(-3, 2),
         "tolerance_mm": lambda: 10.0 ** rng.uniform(-12, 0),
-        "weak": lambda: rng.random(),
+        "weak": rng.random,
         "max_points": lambda: few(rng),
         "normals": lambda: unit(rng, len(at) if isinstance(at, np.ndarray | ws.KdTree) else few(rng)),
     }
@@ -220,7 +220,9 @@ def bodies(rng: Random) -> list[Body]:
 
 
 def simulation(rng: Random) -> Arguments:
-    sets = [(["x", "y"][rng.integers(2)], float(rng.integers(1, 9)), int(rng.integers(3, 6))) for _ in range(few(rng, 3))]
+    sets = [
+        (["x", "y"][rng.integers(2)], float(rng.integers(1, 9)), int(rng.integers(3, 6))) for _ in range(few(rng, 3))
+    ]
     return {
         "scanner": scanner(rng),
         "scene_from_scanner": np.eye(4) if rng.random() < 0.8 else pose(rng),
@@ -294,7 +296,10 @@ SANE: dict[str, Callable[[Random], Arguments]] = {
     "decode_png": png,
     "distance": lambda r: {"points": points(r), "target": target(r), "signed": bool(r.random() < 0.5)},
     "estimate_normals": lambda r: {"points": grid(r) if r.random() < 0.5 else points(r), "k": few(r, 25)},
-    "find_spheres": lambda r: {"points": grid(r) if r.random() < 0.5 else points(r), "radius_mm": 10.0 ** r.uniform(-2, 2)},
+    "find_spheres": lambda r: {
+        "points": grid(r) if r.random() < 0.5 else points(r),
+        "radius_mm": 10.0 ** r.uniform(-2, 2),
+    },
     "fit_cylinder": fit_of_radius,
     "fit_plane": fit,
     "fit_sphere": fit_of_radius,
@@ -302,18 +307,24 @@ SANE: dict[str, Callable[[Random], Arguments]] = {
     "measure_step": lambda r: {"shots": [weld_shot()] * few(r, 3), "angle_sigma_rad": r.random() * 0.01},
     "place_shots": placing,
     "register_icp": registration,
-    "register_rigid": lambda r: {"source": points(r, n := few(r)), "target": points(r, n)}
-    | ({"weights": r.random(n)} if r.random() < 0.5 else {}),
+    "register_rigid": lambda r: (
+        {"source": points(r, n := few(r)), "target": points(r, n)}
+        | ({"weights": r.random(n)} if r.random() < 0.5 else {})
+    ),
     "segment_weld": segmentation,
     "set_threads": lambda r: {"threads": [None, 1, 2][r.integers(3)]},
     "simulate_shot": simulation,
     "simulated_step": lambda r: {"weld": pipe(few(r) * 20.0 + 10), "along": r.normal(size=few(r))},
     "sphere_through_points": lambda r: {"points": points(r, 4)},
-    "triangulate": lambda r: {"column": r.random((12, 16)) * 16, "scanner": scanner(r)}
-    | ({"sigma_px": r.random((12, 16)).astype(np.float32)} if r.random() < 0.5 else {}),
-    "unwrap_spatial": lambda r: {"wrapped": r.normal(size=(h := few(r, 20), w := few(r, 20))) * 3}
-    | ({"mask": r.random((h, w)) < 0.7} if r.random() < 0.5 else {})
-    | ({"quality": r.random((h, w))} if r.random() < 0.5 else {}),
+    "triangulate": lambda r: (
+        {"column": r.random((12, 16)) * 16, "scanner": scanner(r)}
+        | ({"sigma_px": r.random((12, 16)).astype(np.float32)} if r.random() < 0.5 else {})
+    ),
+    "unwrap_spatial": lambda r: (
+        {"wrapped": r.normal(size=(h := few(r, 20), w := few(r, 20))) * 3}
+        | ({"mask": r.random((h, w)) < 0.7} if r.random() < 0.5 else {})
+        | ({"quality": r.random((h, w))} if r.random() < 0.5 else {})
+    ),
     "unwrap_temporal": lambda r: {"wrapped": r.normal(size=(2, few(r), few(r))), "periods": [1.0, 8.0]},
 }
 
@@ -322,10 +333,24 @@ SANE: dict[str, Callable[[Random], Arguments]] = {
 NUMBERS: tuple[Any, ...] = (
     *(np.nan, np.inf, -np.inf, 0, -0.0, 1, -1, 2, 3, 0.5, 1e308, -1e308, 5e-324, 1e-310, 1e-150, 1e155, 1e200, 1e16),
     *(2**31, 2**32 + 1, 2**63 - 1, 2**63, 2**64, -(2**31), -(2**63), -(2**70), 10**30, True, None),
-    *(np.float32(1.5), np.int8(3), np.uint64(2**63), np.array(2.0), np.array([1.0]), 1j, "x", "point", b"y", [], [1, 2, 3]),
+    *(
+        np.float32(1.5),
+        np.int8(3),
+        np.uint64(2**63),
+        np.array(2.0),
+        np.array([1.0]),
+        1j,
+        "x",
+        "point",
+        b"y",
+        [],
+        [1, 2, 3],
+    ),
 )
 """Instead of a number."""
-EXTREMES = np.array([np.nan, np.inf, -np.inf, 0.0, -0.0, 1e308, -1e308, 5e-324, 1e-310, 1e150, -1e150, 1e160, 1e200, 1e16])
+EXTREMES = np.array(
+    [np.nan, np.inf, -np.inf, 0.0, -0.0, 1e308, -1e308, 5e-324, 1e-310, 1e150, -1e150, 1e160, 1e200, 1e16]
+)
 """Within an array."""
 DTYPES = ("f4", "f2", "i1", "i8", "u1", "u2", "?", "c16", "O", "U5", ">f8", "g", "M8[s]", ">u2")
 """Of an array."""
@@ -491,7 +516,7 @@ def work(seed: int, first: int, last: int, stride: int, only: str | None, place:
 
 
 def watch(seed: int, first: int, last: int, stride: int, only: str | None) -> Iterator[dict[str, Any]]:
-    """Runs one worker after another over its inputs; an end that is none is a finding, and the next one goes on after."""
+    """Runs one worker after another over its inputs; the end of one is a finding, and the next goes on after it."""
     while first < last:
         with tempfile.NamedTemporaryFile() as place, tempfile.TemporaryFile("w+") as said:
             place.write(struct.pack("q", first))

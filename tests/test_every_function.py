@@ -3,6 +3,7 @@ while it computes. `catalogue.py` has them at work; a function that is missing t
 
 from __future__ import annotations
 
+import itertools
 import sys
 import threading
 import time
@@ -64,7 +65,7 @@ def longest_wait(call: Callable[[], Any]) -> float:
         sys.setswitchinterval(interval)
         other.join()
     during = [start, *(t for t in ticks if start < t < end), end]
-    return max(b - a for a, b in zip(during, during[1:], strict=False)) / (end - start)
+    return max(b - a for a, b in itertools.pairwise(during)) / (end - start)
 
 
 def is_free(call: Job) -> bool:

@@ -2,7 +2,7 @@ import threading
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
@@ -81,6 +81,8 @@ def test_a_follower_answers_as_a_search():
 coarse = st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=1, max_size=60)
 
 
+# On a loaded machine making the lists takes its time.
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(coarse, coarse, st.integers(1, 5))
 def test_ties_go_to_the_lowest_index(points, queries, k):
     points, queries = np.array(points, float), np.array(queries, float)

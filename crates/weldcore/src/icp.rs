@@ -829,7 +829,7 @@ mod tests {
     fn vectors_and_the_plain_fallback_give_the_same_bits() {
         let (target, normals) = relief(60);
         let tree = KdTree::new(&target).unwrap();
-        let (pose, n) = (pose([0.02, 0.01, -0.01], [0.3, 0.2, -0.1]), target.len());
+        let (pose, n) = (pose([0.002, 0.001, -0.001], [0.3, 0.2, -0.1]), target.len());
         let (mut fast, mut plain) = (vec![Match::default(); n], vec![Match::default(); n]);
         let (mut fast_steps, mut plain_steps) = (vec![Step::NEW; n], vec![Step::NEW; n]);
         to_cloud(&tree, Some(&normals), &pose, &target, &mut fast_steps, &mut fast);

@@ -35,7 +35,6 @@ from weldscan.calibration.hand_eye_model import (
     DIRECTION,
     FACTORS,
     PLACE,
-    PRIOR_DOF,
     SPHERE,
     UNKNOWNS,
     Linear,
@@ -58,8 +57,8 @@ Floats = NDArray[np.float64]
 # The robot's pose, k = 1, where the session does not state it. A repeatability of 0.03 mm (the paper's Table 3) is
 # three sigma by ISO 9283; what counts here is how far poses that look at the plate from all sides are off against each
 # other, an arm's accuracy over a few decimetres: taken as three times that sigma. The angle is the same over the
-# 300 mm of the last links. Both are known to 41 % only, so that one shot alone carries 1.7 times as much; where there
-# are more shots, these say how good the robot is (docs/decisions/0007).
+# 300 mm of the last links. Both are believed to within a factor of two, so that one shot alone carries 1.6 times as
+# much; where there are more shots, these say how good the robot is (docs/decisions/0007).
 POSE_SIGMA_MM = 0.03
 POSE_SIGMA_RAD = POSE_SIGMA_MM / 300
 # Bias that all touches share (probe length, ball radius), mm, k = 1.
@@ -212,7 +211,7 @@ def _robust(linear: Linear) -> tuple[Floats, Floats]:
 
 def _chance(chi2: Floats, others: int) -> Floats:
     """How probable such a chi square of nine degrees is, the noise being known from so many other shots."""
-    dof = 6 * max(others - 1, 0) + PRIOR_DOF[PLACE]
+    dof = 6 * max(others - 1, 0) + 1
     return np.array([f_exceeded(value / 9, 9.0, float(dof)) for value in chi2])
 
 

@@ -7,10 +7,9 @@ the centres c_j in base: 15 numbers. Shot i gives r_ij = X m_ij - F_i^-1 c_j, ni
 
 J_t and J_r moving all three by a small motion of the flange. Touched centres are a prior with the covariance
 f_c sigma_c^2 I + f_b sigma_b^2 (ones x I). The sigmas are what was stated of sphere fits, robot and probe; the factors
-f are 1 where that is right. Each has a scaled inverse chi-square prior, whose degrees of freedom say how well it is
-known beforehand. With X integrated out (restricted likelihood) the shots correct them, and what they leave open of the
-factors is integrated out in turn: the covariance is that of the posterior, and 95 % intervals from it are as wide as
-Student's where the shots are few.
+f are 1 where that is right. Each has a log-normal prior, as wide as what was stated is doubtful. With X integrated out
+(restricted likelihood) the shots correct them, and what they leave open of the factors is integrated out in turn: the
+covariance is that of the posterior, and 95 % intervals from it are as wide as Student's where the shots are few.
 
 Sources: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545 for the restricted likelihood; H. Rue, S. Martino,
 N. Chopin, J. R. Statist. Soc. B 71 (2009) 319 for integrating variances out on a few nodes about their mode;
@@ -30,10 +29,13 @@ Floats = NDArray[np.float64]
 
 # The factors: sphere fits, the pose's place, the pose's direction, each touch's own error, the bias that all share.
 SPHERE, PLACE, DIRECTION, TOUCH, BIAS = range(5)
-# How well each is known beforehand, degrees of freedom (GUM G.4.2: nu = (u/Delta u)^2 / 2). The fit states a sphere's
-# covariance from its own residuals: known to 16 %. Robot and probe go by data sheets and rules of thumb: 41 and 35 %.
-PRIOR_DOF = np.array([20.0, 3.0, 3.0, 4.0, 4.0])
-FACTORS = len(PRIOR_DOF)
+# Within which factor each standard uncertainty is believed beforehand, two times out of three. A fit states a sphere's
+# from its own residuals. Robot and touch go by data sheets and rules of thumb, and the length of a probe by whoever
+# measured it last.
+BELIEVED = np.array([1.25, 2.0, 2.0, 2.0, 3.0])
+FACTORS = len(BELIEVED)
+# The same for the logarithm of a variance.
+WIDTH = 2 * np.log(BELIEVED)
 UNKNOWNS = 15
 # Nodes over the factors: 256 give the covariance to a per cent.
 NODES = 256
@@ -180,7 +182,7 @@ class Linear:
     def cost(self, logs: Floats, keep: Floats | None = None, weights: Floats | None = None) -> Floats:
         """-2 log posterior of the factors, (k,); `logs` (k, 5) are their logarithms."""
         likelihood = self.solve(np.exp(logs), keep, weights)[3]
-        return np.asarray(likelihood + ((logs + np.exp(-logs)) * PRIOR_DOF).sum(axis=1))
+        return np.asarray(likelihood + np.square(logs / WIDTH).sum(axis=1))
 
     def mode(
         self,
@@ -201,8 +203,8 @@ class Linear:
                 mixed = (value - plus[a] - plus[b] + values[0]) / STENCIL**2
                 hessian[a, b] = hessian[b, a] = mixed
             curvature, axes = np.linalg.eigh(hessian)
-            # A factor that the shots say nothing about has at least a tenth of its prior's curvature.
-            curvature = np.maximum(np.abs(curvature), 0.1 * PRIOR_DOF.min())
+            # A factor that the shots say nothing about has its prior's curvature, and none much less.
+            curvature = np.maximum(np.abs(curvature), 1 / np.square(WIDTH).max())
             step = -axes @ ((axes.T @ gradient) / curvature)
             step *= min(1.0, 2.0 / max(float(np.linalg.norm(step)), 1e-12))
             tries = np.array([1.0, 0.5, 0.2, 0.05])
@@ -222,7 +224,7 @@ class Linear:
         logs = mode + nodes @ spread.T
         factors = np.exp(logs)
         step, covariance, _, likelihood = self.solve(factors, keep)
-        cost = likelihood + ((logs + np.exp(-logs)) * PRIOR_DOF).sum(axis=1)
+        cost = likelihood + np.square(logs / WIDTH).sum(axis=1)
         weight = np.exp(-(cost - cost.min()) / 2) / density
         weight /= weight.sum()
         mean = weight @ step

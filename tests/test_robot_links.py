@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from weldscan import DeviceError, DeviceTimeout, KukaPose
-from weldscan.devices.controller import Arm, Fault
+from weldscan.devices.controller import Arm, Fault, TcpController
 from weldscan.devices.eki import EkiController, EkiRobot, EkiSettings
 from weldscan.devices.kinematics import ArmGeometry
 from weldscan.devices.kvp import READ, KvpController, KvpRobot, KvpSettings, encode_request
@@ -469,6 +469,23 @@ def test_connection_refused(link):
     with pytest.raises(DeviceError, match=str(port)):
         KvpRobot(KvpSettings(port=port)) if link == "kvp" else EkiRobot(EkiSettings(port=port))
     assert time.monotonic() - start < 1.0 + LATE_S
+
+
+def test_serial_over_a_terminal_server(arm):
+    """`socket://`, as a serial port on the network has it."""
+
+    class Server(TcpController):
+        cut, answer = SerialController.cut, SerialController.answer
+
+    with Server(arm) as server:
+        url = f"socket://127.0.0.1:{server.port}"
+        with SerialRobot(SerialSettings(port=url, timeout_s=TIMEOUT_S, reconnect_s=2.0)) as robot:
+            assert close_to(robot.pose().flange, FLANGE)
+            server.inject(Fault.RESET)
+            assert close_to(reads_within(robot, 2.0), FLANGE)
+        server.close()
+        with pytest.raises(DeviceError, match="cannot open"):
+            SerialRobot(SerialSettings(port=url, timeout_s=TIMEOUT_S))
 
 
 def test_serial_port_missing():

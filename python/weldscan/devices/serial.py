@@ -120,7 +120,10 @@ class SerialTransport:
 
     def close(self) -> None:
         """Close it."""
+        peer = getattr(self._port, "_socket", None)
         self._port.close()
+        if peer is not None:  # of socket://: pyserial leaves it open where the other side has closed it
+            peer.close()
 
 
 # --- the client -------------------------------------------------------------------------------------------------------

@@ -188,7 +188,7 @@ def project(
     pattern: Annotated[str, typer.Option(help="white, black, a grey level, or all: the plan's fringes.")] = "white",
     hold: Annotated[float, typer.Option(min=0.0, help="Seconds for each pattern; 0: until Ctrl-C.")] = 0.0,
 ) -> None:
-    """Show a pattern on the projector."""
+    """Show a pattern on the projector. On which display: x and y of the cell's [projector]."""
     from weldscan.fringes import flat_pattern, fringe_patterns
     from weldscan.station.cell import read_cell
     from weldscan.station.scan import read_settings

@@ -16,6 +16,8 @@ from weldscan.devices import BACKENDS, backend
 from weldscan.devices.camera import Camera, CameraSettings, TornFrame
 
 WIDTH, HEIGHT = 640, 480
+LATE_S = 1.0
+"""How far beyond its time-out an error may come: a machine that others load too."""
 FAKE = "arv-fake-gv-camera-0.8"
 SMALL_PACKETS = 140
 """For the small images of the scan's tests: 17 packets each, of which all arrive for 7 images of 10."""
@@ -208,20 +210,21 @@ def test_no_torn_image_in_a_shot(fake_gige, tmp_path):
     assert all(is_whole(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)) for path in images)
 
 
-def test_aravis_unplugged(fake_gige, soak):
-    if not soak:
-        pytest.skip("takes 15 s, for the library asks the lost camera again and again: --soak")
+def test_aravis_unplugged(fake_gige):
+    """The library asks a lost camera again and again; the error is in time all the same."""
     camera = backend("camera", "aravis")
     name, process = fake_gige()
-    with camera(camera.Settings(device=name, exposure_s=0.005, timeout_s=1.5)) as device:
+    with camera(camera.Settings(device=name, exposure_s=0.005, timeout_s=1.0)) as device:
         device.capture()
         process.kill()
         process.wait()
-        start = time.monotonic()
-        with pytest.raises(DeviceError):
-            for _ in range(5):
+        for _ in range(2):
+            start = time.monotonic()
+            with pytest.raises(DeviceError, match=r"unplugged|trigger|torn"):
                 device.capture()
-        assert time.monotonic() - start < 10.0  # the library itself waits for the lost camera's registers
+            assert time.monotonic() - start < 1.0 + LATE_S
+        start = time.monotonic()
+    assert time.monotonic() - start < 2.0 + LATE_S  # closing a camera that is not there
 
 
 def test_aravis_no_such_camera():
@@ -352,7 +355,7 @@ class Broken(Camera):
             raise result
         return result
 
-    def close(self):
+    def _close(self):
         pass
 
 

@@ -86,8 +86,7 @@ class AravisCamera(Camera):
         aravis.update_device_list()
         return [aravis.get_device_id(i) for i in range(aravis.get_n_devices())]
 
-    def close(self) -> None:
-        """Stop, and let go of the camera."""
+    def _close(self) -> None:
         with contextlib.suppress(self._glib.Error):  # it may be gone already
             self._camera.stop_acquisition()
         self._stream = self._camera = None

@@ -5,10 +5,13 @@ error.
 from __future__ import annotations
 
 import abc
+import contextlib
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +20,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from weldscan.errors import DeviceError, DeviceTimeout
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
+T = TypeVar("T")
+GRACE_S = 0.25
+"""Beyond the deadline, so that a driver's own complaint is heard first."""
+CLOSE_S = 2.0
 EXPOSURE_TOLERANCE = 0.02
 """How far the exposure that was read back may be from the wanted one; cameras count lines or microseconds."""
 
@@ -66,6 +73,7 @@ class Camera(abc.ABC):
     name: str
     exposure_s: float = 0.0
     _size: tuple[int, int] | None = None
+    _thread: ThreadPoolExecutor | None = None
 
     @classmethod
     def available(cls) -> list[str]:
@@ -81,12 +89,20 @@ class Camera(abc.ABC):
         """Return one exposure that began after the call; `TornFrame` where parts of it are missing."""
 
     @abc.abstractmethod
-    def close(self) -> None:
+    def _close(self) -> None:
         """Let go of the camera."""
+
+    def close(self) -> None:
+        """Let go of the camera; one that does not answer is not waited for."""
+        closing = self._own_thread().submit(self._close)
+        self._own_thread().shutdown(wait=False)
+        self._thread = None
+        with contextlib.suppress(TimeoutError):
+            closing.result(CLOSE_S)
 
     def set_exposure(self, exposure_s: float) -> float:
         """Set the exposure time and return what was read back. Raises `DeviceError` where the camera does otherwise."""
-        actual = self._set_exposure(exposure_s)
+        actual = self._in_time(time.monotonic() + self.settings.timeout_s, lambda: self._set_exposure(exposure_s))
         if not abs(actual - exposure_s) <= EXPOSURE_TOLERANCE * exposure_s:
             raise DeviceError(f"{self.name}: exposure is {actual * 1000:g} ms, not {exposure_s * 1000:g} ms")
         self.exposure_s = actual
@@ -97,12 +113,28 @@ class Camera(abc.ABC):
         give_up_s = time.monotonic() + self.settings.timeout_s + self.exposure_s
         for attempt in range(self.settings.retries + 1):
             try:
-                image = self._checked(self._grab(give_up_s))
+                image = self._checked(self._in_time(give_up_s, lambda: self._grab(give_up_s)))
                 return Frame(image, time.monotonic(), attempt)
             except TornFrame as error:
                 if time.monotonic() > give_up_s:
                     raise DeviceTimeout(f"{self.name}: only torn frames, {attempt + 1} of them") from error
         raise DeviceError(f"{self.name}: {self.settings.retries + 1} torn frames in a row")
+
+    def _in_time(self, deadline_s: float, call: Callable[[], T]) -> T:
+        """Let a thread of the camera's own do it: a driver that is deaf to everything does not hold us up."""
+        doing = self._own_thread().submit(call)
+        try:
+            return doing.result(max(deadline_s - time.monotonic(), 0.0) + GRACE_S)
+        except DeviceError:
+            raise  # a `DeviceTimeout` is a `TimeoutError` too
+        except TimeoutError:
+            doing.cancel()  # where an earlier one is still under way
+            raise DeviceTimeout(f"{self.name}: does not answer: is it unplugged?") from None
+
+    def _own_thread(self) -> ThreadPoolExecutor:
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, "camera")
+        return self._thread
 
     def _checked(self, image: NDArray[Any]) -> Image:
         if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16) or 0 in image.shape:

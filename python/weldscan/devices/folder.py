@@ -40,7 +40,7 @@ class FolderCamera(Camera):
         self._files = cycle(files) if settings.repeat else iter(files)
         self.set_exposure(settings.exposure_s)
 
-    def close(self) -> None:
+    def _close(self) -> None:
         """Nothing is open."""
 
     def _set_exposure(self, exposure_s: float) -> float:

@@ -8,8 +8,6 @@ back.
 from __future__ import annotations
 
 import time
-from concurrent.futures import ThreadPoolExecutor
-from concurrent.futures import TimeoutError as NotInTime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -49,8 +47,6 @@ class OpenCvCamera(Camera):
         if settings.trigger == "hardware":
             raise DeviceError(f"{self.name}: V4L2 knows no hardware trigger")
         self._capture = cv2.VideoCapture(settings.device, cv2.CAP_V4L2)
-        # OpenCV itself waits 10 s for a frame, deaf to everything: a thread of its own waits instead of us.
-        self._waiter = ThreadPoolExecutor(1, "v4l2")
         if not self._capture.isOpened():
             raise DeviceError(f"{self.name}: cannot be opened")
         try:
@@ -73,10 +69,8 @@ class OpenCvCamera(Camera):
         """Return the video devices of Linux."""
         return sorted(str(path) for path in Path("/dev").glob("video*"))
 
-    def close(self) -> None:
-        """Let go of the camera."""
-        self._waiter.submit(self._capture.release)
-        self._waiter.shutdown(wait=False)
+    def _close(self) -> None:
+        self._capture.release()
 
     def _set(self, name: str, key: int, value: float) -> None:
         self._capture.set(key, value)
@@ -91,13 +85,11 @@ class OpenCvCamera(Camera):
     def _grab(self, deadline_s: float) -> NDArray[Any]:
         asked_s = time.monotonic()
         for _ in range(self.settings.queue + 2):
-            try:
-                there = self._waiter.submit(self._capture.grab).result(max(deadline_s - time.monotonic(), 0.0))
-            except NotInTime as error:
-                raise DeviceTimeout(f"{self.name}: no frame in time: is it unplugged?") from error
-            if not there:
+            if not self._capture.grab():  # which waits for 10 s, whatever the deadline: see `Camera._in_time`
                 raise DeviceError(f"{self.name}: no frame: is it unplugged?")
             now_s = time.monotonic()
+            if now_s > deadline_s:
+                raise DeviceTimeout(f"{self.name}: no frame in time")
             # A frame that had to be waited for is not from the queue; it began after the question if it took that long.
             if now_s - asked_s > 2 * self.exposure_s:
                 break

@@ -74,8 +74,7 @@ class PylonCamera(Camera):
         pylon, _ = _library()
         return [info.GetSerialNumber() for info in pylon.TlFactory.GetInstance().EnumerateDevices()]
 
-    def close(self) -> None:
-        """Stop, and let go of the camera."""
+    def _close(self) -> None:
         try:
             self._camera.StopGrabbing()
             self._camera.Close()

@@ -58,6 +58,8 @@ class VirtualCameraSettings(CameraSettings):
     """`[camera]` with `backend = "simulated"`."""
 
     backend: Literal["simulated"] = "simulated"
+    timeout_s: Annotated[float, Field(gt=0, le=600)] = 120.0
+    """Rendering takes seconds where others compute as well."""
     controller: dict[str, Any] = Field(default_factory=dict)
     """A robot section: the simulated controller that carries this camera; empty: it stands at the first part pose."""
     nominal_exposure_s: Annotated[float, Field(gt=0)] = 1 / 30
@@ -98,8 +100,7 @@ class VirtualCamera(Camera):
         """There is always one."""
         return ["the demo's cell"]
 
-    def close(self) -> None:
-        """Let go of the controller."""
+    def _close(self) -> None:
         if self._robot is not None:
             self._robot.close()
 

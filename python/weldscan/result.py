@@ -348,6 +348,8 @@ class ScannerCalibration:
     """The middle and the corners."""
     coverage: tuple[float, float]
     """Share of the camera's and of the projector's image (8 x 6 fields) in which there is a feature."""
+    board_sigma_mm: tuple[float, float] | None
+    """How far the board's features are off its drawing, one coordinate, in its plane and out of it; None: not seen."""
     jackknife_mm: float | None
     """Standard uncertainty of the volume's shape (rms) by leaving out one pose after the other."""
     shape_u_mm: float

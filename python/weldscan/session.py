@@ -164,6 +164,7 @@ class ScannerSpec(_Model):
     date: Annotated[str, Field(max_length=100)] | None = None
     valid_until: Annotated[str, Field(pattern=r"^\d{4}-\d\d-\d\d$")] | None = None
     board: Annotated[str, Field(max_length=200)] | None = None
+    board_sigma_mm: tuple[float, float] | None = None
     temperature_c: Annotated[float, Field(ge=-100, le=200)] | None = None
     covariance: CovarianceSpec | None = None
     rms_px: dict[str, float] | None = None
@@ -538,6 +539,7 @@ def write_scanner(path: str | os.PathLike[str], found: ScannerCalibration) -> Sc
         "date": found.date,
         "valid_until": found.valid_until,
         "board": found.board,
+        "board_sigma_mm": found.board_sigma_mm,
         "temperature_c": found.temperature_c,
         **lenses,
         "camera_from_projector": found.camera_from_projector,

@@ -15,13 +15,17 @@ by Levenberg-Marquardt with analytic Jacobians; the poses are eliminated block b
 s_c and s_p come from the median residual. The covariance is that of the M-estimate (P. Huber, Robust Statistics (1981),
 7.6) with each device's variance from its own redundancy (K.-R. Koch, Parameter Estimation (1999), 3.6).
 
+A printed board is neither flat nor as drawn. Where the residuals of a feature repeat from view to view (`repeats`), the
+board's own shape is solved for as well: three coordinates per feature with a normal prior about the drawing, whose
+widths in and out of the plane come from the data (variance components, the same source).
+
 Every parameter has a prior so wide that it counts only where the views say nothing at all.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -49,8 +53,10 @@ TUKEY, HUBER = 5.12, 1.5
 # The median length of a two-dimensional normal residual, in sigmas.
 MEDIAN_OF_RAYLEIGH = math.sqrt(2 * math.log(2))
 MAX_ITERATIONS = 60
+# Leaving one out of fewer views leaves nothing to compare with.
+LEAST_VIEWS = 3
 # A step is over when no lens parameter moves by more than this part of its own uncertainty.
-STEP_TOLERANCE = 1e-6
+STEP_TOLERANCE = 1e-4
 # The scale cannot fall below this: residuals of made-up, noiseless features are zero.
 LEAST_SCALE_PX = 1e-6
 
@@ -71,6 +77,8 @@ class Features:
     """(N, 2, 2), d projector / d camera; zeros: errors of the two are independent."""
     relative_sigma: Floats
     """(N,) of the projector's coordinates, 1 for a typical one."""
+    number: NDArray[np.intp]
+    """(N,) which of the board's P features."""
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -81,9 +89,15 @@ class Features:
         """Those of some views, renumbered."""
         number = {view: i for i, view in enumerate(views)}
         kept = np.isin(self.view, list(views))
-        index = np.array([number[v] for v in self.view[kept]], dtype=np.intp)
-        arrays = (self.board_mm, self.camera_px, self.projector_px, self.slope, self.relative_sigma)
-        return Features(index, *(array[kept] for array in arrays))
+        return Features(
+            np.array([number[v] for v in self.view[kept]], dtype=np.intp),
+            self.board_mm[kept],
+            self.camera_px[kept],
+            self.projector_px[kept],
+            self.slope[kept],
+            self.relative_sigma[kept],
+            self.number[kept],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +115,8 @@ class Model:
     """(views, 3, 3), camera_from_board."""
     shifts: Floats
     """(views, 3), mm."""
+    shape: Floats
+    """(P, 3), mm: by how much the board's features are off the drawing."""
 
     def moved(self, step: Floats, pose_steps: Floats) -> Model:
         """The model after a step of PARAMETERS and of the poses, (views, 6)."""
@@ -111,6 +127,7 @@ class Model:
             self.shift + step[21:24],
             np.array([rotation(d[:3]) @ r for d, r in zip(pose_steps, self.turns, strict=True)]),
             self.shifts + pose_steps[:, 3:],
+            self.shape,
         )
 
     def of(self, views: Sequence[int]) -> Model:
@@ -146,6 +163,8 @@ class Solution:
     """(24, 24) with the poses eliminated, priors included."""
     without: Floats
     """(views, 24): how PARAMETERS move when one view is left out, to first order."""
+    board_sigma_mm: tuple[float, float] | None = None
+    """How far the board's features are off the drawing, one coordinate in its plane and out of it; None: not asked."""
 
 
 # --- projection with its derivatives ----------------------------------------------------------------------------------
@@ -207,17 +226,28 @@ class _Rows:
 
     residuals: Floats
     raw_projector: Floats
-    by_globals: Floats
+    by_lenses: Floats
+    """... by the 24 PARAMETERS."""
     by_pose: Floats
+    """... by the 6 of the view's pose."""
+    by_point: Floats
+    """... by the 3 of the feature's place on the board."""
 
     def of(self, kept: NDArray[np.bool_]) -> _Rows:
         """Those of some features."""
-        return _Rows(self.residuals[kept], self.raw_projector[kept], self.by_globals[kept], self.by_pose[kept])
+        return _Rows(
+            self.residuals[kept],
+            self.raw_projector[kept],
+            self.by_lenses[kept],
+            self.by_pose[kept],
+            self.by_point[kept],
+        )
 
 
-def rows_of(model: Model, f: Features, derivatives: bool = True) -> _Rows | None:
+def rows_of(model: Model, f: Features) -> _Rows | None:
     """All residuals, in pixels, with r_p freed of the corner's error; None where a point is behind a device."""
-    turned = np.einsum("nab,nb->na", model.turns[f.view], f.board_mm)
+    turns = model.turns[f.view]
+    turned = np.einsum("nab,nb->na", turns, f.board_mm + model.shape[f.number])
     in_camera = turned + model.shifts[f.view]
     from_projector = in_camera - model.shift
     in_projector = from_projector @ model.turn
@@ -232,23 +262,21 @@ def rows_of(model: Model, f: Features, derivatives: bool = True) -> _Rows | None
     residuals[:, 1] = raw - np.einsum("nab,nb->na", f.slope, residuals[:, 0])
     if not np.isfinite(residuals[:, 0]).all():
         return None
-    if not derivatives:
-        return _Rows(residuals, raw, np.empty(0), np.empty(0))
-    by_globals = np.zeros((n, 2, 2, 24))
-    by_pose = np.zeros((n, 2, 2, 6))
-    by_globals[:, 0, :, CAMERA] = lens_c
+    by_lenses, by_pose, by_point = np.zeros((n, 2, 2, 24)), np.zeros((n, 2, 2, 6)), np.empty((n, 2, 2, 3))
+    by_lenses[:, 0, :, CAMERA] = lens_c
     by_pose[:, 0, :, :3] = -point_c @ skew(turned)
     by_pose[:, 0, :, 3:] = point_c
     # X_p = R^T (X_c - t); a turn exp(w) of R moves it by R^T [X_c - t]x w.
     by_camera_point = point_p @ model.turn.T
-    by_globals[:, 1, :, PROJECTOR] = lens_p
-    by_globals[:, 1, :, 18:21] = by_camera_point @ skew(from_projector)
-    by_globals[:, 1, :, 21:24] = -by_camera_point
+    by_lenses[:, 1, :, PROJECTOR] = lens_p
+    by_lenses[:, 1, :, 18:21] = by_camera_point @ skew(from_projector)
+    by_lenses[:, 1, :, 21:24] = -by_camera_point
     by_pose[:, 1, :, :3] = -by_camera_point @ skew(turned)
     by_pose[:, 1, :, 3:] = by_camera_point
-    by_globals[:, 1] -= f.slope @ by_globals[:, 0]
-    by_pose[:, 1] -= f.slope @ by_pose[:, 0]
-    return _Rows(residuals, raw, by_globals, by_pose)
+    by_point[:, 0], by_point[:, 1] = point_c @ turns, by_camera_point @ turns
+    for derivative in (by_lenses, by_pose, by_point):
+        derivative[:, 1] -= f.slope @ derivative[:, 0]
+    return _Rows(residuals, raw, by_lenses, by_pose, by_point)
 
 
 # --- the start --------------------------------------------------------------------------------------------------------
@@ -270,7 +298,7 @@ def start(f: Features, camera_size: tuple[int, int], projector_size: tuple[int, 
     u, _, vt = np.linalg.svd(np.sum(relations, axis=0))
     turn = np.asarray(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt)
     shift = np.median([shifts[i] - turn @ shifts_p[k] for k, i in enumerate(both)], axis=0)
-    return Model(camera, projector, turn, np.asarray(shift), turns, shifts)
+    return Model(camera, projector, turn, np.asarray(shift), turns, shifts, np.zeros((int(f.number.max()) + 1, 3)))
 
 
 def _device(f: Features, pixels: Floats, views: Sequence[int], size: tuple[int, int]) -> tuple[Floats, Floats, Floats]:
@@ -321,13 +349,137 @@ def prior_sigmas(model: Model, camera_size: tuple[int, int], projector_size: tup
 # --- the adjustment ---------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What stays the same while it is solved.
+
+    The unknowns are a core, solved densely, and blocks that are eliminated from it: the poses from the lenses; with the
+    board's shape the features' places from lenses and poses.
+    """
+
+    f: Features
+    centre: Model
+    prior: Floats
+    """(24,) sigmas of PARAMETERS."""
+    free: NDArray[np.intp]
+    """Which of PARAMETERS are solved for."""
+    board_sigma: Floats | None
+    """(3,) the prior of a feature's place on the board, where that is solved for."""
+    inverse_sigma: Floats
+    """(N, 2)"""
+
+    @property
+    def views(self) -> int:
+        return len(self.centre.turns)
+
+    @property
+    def core(self) -> NDArray[np.intp]:
+        """The free ones of the core's unknowns."""
+        if self.board_sigma is None:
+            return self.free
+        return np.concatenate([self.free, np.arange(24, 24 + 6 * self.views)])
+
+    def of(self, views: Sequence[int]) -> _Problem:
+        """The same with some of the views."""
+        kept = np.isin(self.f.view, list(views))
+        return replace(self, f=self.f.of(views), centre=self.centre.of(views), inverse_sigma=self.inverse_sigma[kept])
+
+    def off(self, model: Model) -> tuple[Floats, Floats]:
+        """What the priors pull at: PARAMETERS but for turns, and places on the board."""
+        out = np.zeros(24)
+        out[CAMERA], out[PROJECTOR] = model.camera - self.centre.camera, model.projector - self.centre.projector
+        out[21:24] = model.shift - self.centre.shift
+        return out, model.shape - self.centre.shape
+
+    def prior_cost(self, model: Model) -> float:
+        lenses, board = self.off(model)
+        cost = float(np.square(lenses / self.prior).sum()) / 2
+        return cost if self.board_sigma is None else cost + float(np.square(board / self.board_sigma).sum()) / 2
+
+    def moved(self, model: Model, core: Floats, blocks: Floats) -> Model:
+        """The model after a step."""
+        if self.board_sigma is None:
+            return model.moved(core, blocks)
+        return replace(model.moved(core[:24], core[24:].reshape(-1, 6)), shape=model.shape + blocks)
+
+
+@dataclass(frozen=True, eq=False)
+class _Normal:
+    """Normal equations: of the core, of each block, and what joins them; priors included."""
+
+    a: Floats
+    b: Floats
+    c: Floats
+    gradient: Floats
+    block_gradient: Floats
+
+    def reduced(self) -> Floats:
+        """Information on the core with the blocks eliminated."""
+        across: Floats = np.asarray(np.linalg.solve(self.c, np.swapaxes(self.b, 1, 2)))
+        return np.asarray(self.a - _summed(self.b, across))
+
+
+def _summed(b: Floats, y: Floats) -> Floats:
+    """Sum over blocks of B Y, as one product."""
+    count, size, own = b.shape
+    return np.asarray(np.moveaxis(b, 0, 1).reshape(size, count * own) @ y.reshape(count * own, -1))
+
+
+def _normal(p: _Problem, model: Model, rows: _Rows, weight: Floats, priors: bool = True) -> _Normal:
+    """Weighted normal equations of the free unknowns."""
+    root = np.sqrt(weight)[..., None]
+    residuals = np.nan_to_num(rows.residuals) * root
+    n = len(p.f.view)
+    if p.board_sigma is None:
+        core, block, group, count = rows.by_lenses, rows.by_pose, p.f.view, p.views
+    else:
+        poses = np.zeros((n, 2, 2, p.views, 6))
+        poses[np.arange(n), :, :, p.f.view] = rows.by_pose
+        core = np.concatenate([rows.by_lenses, poses.reshape(n, 2, 2, -1)], axis=3)
+        block, group, count = rows.by_point, p.f.number, len(model.shape)
+    core, block = core[..., p.core] * root[..., None], block * root[..., None]
+    size, own = core.shape[-1], block.shape[-1]
+    order = np.argsort(group, kind="stable")
+    edges = np.searchsorted(group[order], np.arange(count + 1))
+    core, block, residuals = core[order], block[order], residuals[order]
+    flat, right = core.reshape(-1, size), residuals.reshape(-1)
+    a, gradient = flat.T @ flat, flat.T @ right
+    b, c, block_gradient = np.zeros((count, size, own)), np.zeros((count, own, own)), np.zeros((count, own))
+    for k, (low, high) in enumerate(pairwise(edges)):
+        g, h, r = core[low:high].reshape(-1, size), block[low:high].reshape(-1, own), residuals[low:high].reshape(-1)
+        b[k], c[k], block_gradient[k] = g.T @ h, h.T @ h, h.T @ r
+    if priors:
+        lenses, board = p.off(model)
+        few = len(p.free)
+        a[np.arange(few), np.arange(few)] += p.prior[p.free] ** -2.0
+        gradient[:few] += lenses[p.free] * p.prior[p.free] ** -2.0
+        if p.board_sigma is not None:
+            c += np.diag(p.board_sigma**-2.0)
+            block_gradient += board * p.board_sigma**-2.0
+    return _Normal(a, b, c, gradient, block_gradient)
+
+
+def _step(p: _Problem, n: _Normal, damping: float) -> tuple[Floats, Floats, float]:
+    """One damped step of core and blocks, scaled by the diagonal (Marquardt); and how large it is, in sigmas."""
+    c = n.c + damping * np.einsum("vii->vi", n.c)[:, :, None] * np.eye(n.c.shape[1])
+    across = np.linalg.solve(c, np.concatenate([np.swapaxes(n.b, 1, 2), -n.block_gradient[..., None]], axis=2))
+    reduced = n.a + damping * np.diag(np.diag(n.a)) - _summed(n.b, across[..., :-1])
+    right = -n.gradient - _summed(n.b, across[..., -1:])[:, 0]
+    scale = np.sqrt(np.maximum(np.abs(np.diag(reduced)), 1e-300))
+    found = np.linalg.solve(reduced / np.outer(scale, scale), right / scale) / scale
+    size = 24 if p.board_sigma is None else 24 + 6 * p.views
+    core = np.zeros(size)
+    core[p.core] = found
+    return core, across[..., -1] - across[..., :-1] @ found, float(np.abs(found * scale).max())
+
+
 def solve(
     f: Features,
     first: Model,
     prior_sigma: Floats,
     *,
     k3: bool = False,
-    scale_px: tuple[float, float] | None = None,
+    board_sigma_mm: tuple[float, float] | None = None,
 ) -> Solution:
     """The joint adjustment.
 
@@ -336,34 +488,39 @@ def solve(
         first: where to start.
         prior_sigma: see `prior_sigmas`.
         k3: solve for both lenses' third radial term.
-        scale_px: noise of camera and projector where they are known already; then Tukey's weights from the start.
+        board_sigma_mm: solve for the board's shape too, with this prior in its plane and out of it.
 
     Raises:
         GeometryError: it does not converge.
     """
-    free = np.array([i for i in range(24) if k3 or i not in K3])
-    centre = first
-    model = first
-    seen = f.seen
-    sigma = 1 / np.stack([np.ones(len(f.view)), f.relative_sigma], axis=1)
-    rows = rows_of(model, f)
+    board = None if board_sigma_mm is None else np.array([board_sigma_mm[0], board_sigma_mm[0], board_sigma_mm[1]])
+    p = _Problem(
+        f,
+        replace(first, shape=np.zeros_like(first.shape)),
+        prior_sigma,
+        np.array([i for i in range(24) if k3 or i not in K3]),
+        board,
+        1 / np.stack([np.ones(len(f.view)), f.relative_sigma], axis=1),
+    )
+    model, rows = first, rows_of(first, f)
     if rows is None:
         raise GeometryError("the start puts a board behind the scanner")
-    scales = scale_px or _scales(rows, sigma, seen)
-    for robust in (_huber, _tukey, _tukey, _tukey) if scale_px is None else (_tukey, _tukey):
+    scales = _scales(p, rows)
+    # Rounds about the board's shape start where the last one ended.
+    for robust in (_huber, _tukey, _tukey, _tukey) if board is None else (_tukey, _tukey):
         before = scales
-        model, rows = _minimise(f, model, rows, sigma / np.array(scales), robust, seen, free, centre, prior_sigma)
-        scales = _scales(rows, sigma, seen)
+        model, rows = _minimise(p, model, rows, np.array(scales), robust)
+        scales = _scales(p, rows)
         if robust is _tukey and all(abs(a / b - 1) < 1e-3 for a, b in zip(scales, before, strict=True)):
             break
-    return _finish(f, model, rows, sigma, scales, seen, free, prior_sigma)
+    return _finish(p, model, rows, np.array(scales))
 
 
-def _scales(rows: _Rows, inverse_sigma: Floats, seen: NDArray[np.bool_]) -> tuple[float, float]:
-    lengths = np.linalg.norm(rows.residuals, axis=2) * inverse_sigma
-    camera, projector = np.median(lengths[:, 0]), np.median(lengths[seen, 1]) if seen.any() else 1.0
-    scales = [max(float(value) / MEDIAN_OF_RAYLEIGH, LEAST_SCALE_PX) for value in (camera, projector)]
-    return scales[0], scales[1]
+def _scales(p: _Problem, rows: _Rows) -> tuple[float, float]:
+    lengths, seen = np.linalg.norm(rows.residuals, axis=2) * p.inverse_sigma, p.f.seen
+    medians = np.median(lengths[:, 0]), np.median(lengths[seen, 1]) if seen.any() else 1.0
+    camera, projector = (max(float(value) / MEDIAN_OF_RAYLEIGH, LEAST_SCALE_PX) for value in medians)
+    return camera, projector
 
 
 def _huber(s: Floats) -> tuple[Floats, Floats]:
@@ -379,202 +536,170 @@ def _tukey(s: Floats) -> tuple[Floats, Floats]:
 
 
 def _minimise(
-    f: Features,
-    model: Model,
-    rows: _Rows,
-    inverse_scale: Floats,
-    robust: object,
-    seen: NDArray[np.bool_],
-    free: NDArray[np.intp],
-    centre: Model,
-    prior_sigma: Floats,
+    p: _Problem, model: Model, rows: _Rows, scales: Floats, robust: Callable[[Floats], tuple[Floats, Floats]]
 ) -> tuple[Model, _Rows]:
     """Levenberg-Marquardt at fixed scales."""
-    weigh = robust if callable(robust) else _huber
+    inverse_scale, seen = p.inverse_sigma / scales, p.f.seen
 
-    def cost_of(model: Model, rows: _Rows) -> float:
-        s = np.linalg.norm(rows.residuals, axis=2) * inverse_scale
-        _, cost = weigh(s)
-        off = _off(model, centre) / prior_sigma
-        return float(cost[:, 0].sum() + cost[seen, 1].sum() + off @ off / 2)
-
-    damping = 1e-6
-    cost = cost_of(model, rows)
-    for _ in range(MAX_ITERATIONS):
-        s = np.linalg.norm(rows.residuals, axis=2) * inverse_scale
-        weight, _ = weigh(s)
+    def weigh(rows: _Rows) -> tuple[Floats, float]:
+        weight, cost = robust(np.linalg.norm(np.nan_to_num(rows.residuals), axis=2) * inverse_scale)
         weight = weight * inverse_scale**2
         weight[~seen, 1] = 0
-        blocks = _blocks(f, rows, weight)
-        off = _off(model, centre)
+        return weight, float(cost[:, 0].sum() + cost[seen, 1].sum())
+
+    damping = 1e-6
+    weight, cost = weigh(rows)
+    cost += p.prior_cost(model)
+    for _ in range(MAX_ITERATIONS):
+        normal = _normal(p, model, rows, weight)
         while True:
-            step, poses = _step(blocks, free, off, prior_sigma, damping)
-            trial = model.moved(step, poses)
-            trial_rows = rows_of(trial, f) if np.isfinite(step).all() and np.isfinite(poses).all() else None
-            trial_cost = math.inf if trial_rows is None else cost_of(trial, trial_rows)
-            if trial_cost <= cost * (1 + 1e-12):
-                break
+            core, blocks, size = _step(p, normal, damping)
+            finite = bool(np.isfinite(core).all() and np.isfinite(blocks).all())
+            trial = p.moved(model, core, blocks) if finite else model
+            trial_rows = rows_of(trial, p.f) if finite else None
+            if trial_rows is not None:
+                trial_weight, trial_cost = weigh(trial_rows)
+                trial_cost += p.prior_cost(trial)
+                if trial_cost <= cost * (1 + 1e-12) + 1e-12:
+                    break
             damping = max(damping, 1e-9) * 10
             if damping > 1e9:
                 return model, rows
-        assert trial_rows is not None
         gained = cost - trial_cost
-        model, rows, cost = trial, trial_rows, trial_cost
+        model, rows, weight, cost = trial, trial_rows, trial_weight, trial_cost
         damping = max(damping / 10, 1e-12)
-        sizes = np.abs(step[free]) * np.sqrt(np.diag(blocks.reduced(free, prior_sigma)))
-        if sizes.max() < STEP_TOLERANCE or gained <= 1e-12 * cost:
+        if size < STEP_TOLERANCE or gained <= 1e-8 * cost:
             break
     return model, rows
 
 
-def _off(model: Model, centre: Model) -> Floats:
-    """How far the lenses and the shift are from where they started; turns need no prior."""
-    out = np.zeros(24)
-    out[CAMERA], out[PROJECTOR] = model.camera - centre.camera, model.projector - centre.projector
-    out[21:24] = model.shift - centre.shift
-    return out
-
-
-@dataclass(frozen=True, eq=False)
-class _Blocks:
-    """Normal equations in blocks: of the 24, of each pose, and what joins them."""
-
-    a: Floats
-    b: Floats
-    c: Floats
-    gradient: Floats
-    pose_gradient: Floats
-
-    def reduced(self, free: NDArray[np.intp], prior_sigma: Floats) -> Floats:
-        """Information on the free ones with the poses eliminated."""
-        solved = np.linalg.solve(self.c, np.swapaxes(self.b, 1, 2))
-        whole = self.a - np.einsum("vij,vjk->ik", self.b, solved) + np.diag(prior_sigma**-2.0)
-        return np.asarray(whole[np.ix_(free, free)])
-
-
-def _blocks(f: Features, rows: _Rows, weight: Floats) -> _Blocks:
-    views = int(f.view.max()) + 1
-    edges = np.searchsorted(f.view, np.arange(views + 1))
-    a, gradient = np.zeros((24, 24)), np.zeros(24)
-    b, c, pose_gradient = np.zeros((views, 24, 6)), np.zeros((views, 6, 6)), np.zeros((views, 6))
-    root = np.sqrt(weight)[..., None]
-    residuals = np.nan_to_num(rows.residuals) * root
-    by_globals, by_pose = rows.by_globals * root[..., None], rows.by_pose * root[..., None]
-    for v, (low, high) in enumerate(pairwise(edges)):
-        g, p = by_globals[low:high].reshape(-1, 24), by_pose[low:high].reshape(-1, 6)
-        r = residuals[low:high].reshape(-1)
-        a += g.T @ g
-        gradient += g.T @ r
-        b[v], c[v], pose_gradient[v] = g.T @ p, p.T @ p, p.T @ r
-    return _Blocks(a, b, c, gradient, pose_gradient)
-
-
-def _step(
-    blocks: _Blocks, free: NDArray[np.intp], off: Floats, prior_sigma: Floats, damping: float
-) -> tuple[Floats, Floats]:
-    """One damped step of the 24 and of the poses, scaled by the diagonal (Marquardt)."""
-    a = blocks.a + np.diag(prior_sigma**-2.0)
-    a = a + damping * np.diag(np.diag(a))
-    diagonal = np.einsum("vii->vi", blocks.c)
-    c = blocks.c + damping * diagonal[:, :, None] * np.eye(6)
-    right = -(blocks.gradient + off * prior_sigma**-2.0)
-    across = np.linalg.solve(c, np.swapaxes(blocks.b, 1, 2))
-    pose_part = np.linalg.solve(c, -blocks.pose_gradient[..., None])[..., 0]
-    reduced = a - np.einsum("vij,vjk->ik", blocks.b, across)
-    right = right - np.einsum("vij,vj->i", blocks.b, pose_part)
-    reduced, right = reduced[np.ix_(free, free)], right[free]
-    scale = np.sqrt(np.abs(np.diag(reduced)))
-    step = np.zeros(24)
-    step[free] = np.linalg.solve(reduced / np.outer(scale, scale), right / scale) / scale
-    return step, pose_part - np.einsum("vij,j->vi", across, step)
-
-
-def _finish(
-    f: Features,
-    model: Model,
-    rows: _Rows,
-    inverse_sigma: Floats,
-    scales: tuple[float, float],
-    seen: NDArray[np.bool_],
-    free: NDArray[np.intp],
-    prior_sigma: Floats,
-) -> Solution:
+def _finish(p: _Problem, model: Model, rows: _Rows, scales: Floats) -> Solution:
     """Covariance: the variance of each device from its residuals, its redundancy, and Tukey's loss of efficiency."""
-    weight = np.zeros((len(f.view), 2))
-    s = np.linalg.norm(rows.residuals, axis=2) * inverse_sigma / np.array(scales)
-    inside = np.where(s < TUKEY, 1 - np.square(s / TUKEY), 0)
-    inside[~seen, 1] = 0
-    weight = inside**2
-    effective = np.array(scales)
-    sigmas = np.array(scales)
+    seen = p.f.seen
+    s = np.linalg.norm(np.nan_to_num(rows.residuals), axis=2) * p.inverse_sigma / scales
+    root = np.where(s < TUKEY, 1 - np.square(s / TUKEY), 0)
+    root[~seen, 1] = 0
+    weight, kept = root**2, root > 0
+    effective, sigmas = scales.copy(), scales.copy()
     for _ in range(3):
-        whitened = inverse_sigma**2 / effective**2
-        whitened[~seen, 1] = 0
-        used = whitened * (weight > 0)
-        blocks = _blocks(f, rows, used)
-        information = blocks.reduced(free, prior_sigma)
+        used = p.inverse_sigma**2 / effective**2 * kept
+        normal = _normal(p, model, rows, used)
+        inverse = _inverse(normal.reduced())
         for device in (0, 1):
             own = used.copy()
             own[:, 1 - device] = 0
-            taken = _trace(_blocks(f, rows, own), blocks, free, prior_sigma)
-            kept = weight[:, device] > 0
-            count = 2.0 * kept.sum()
-            redundancy = max(count - taken, 0.1 * count)
+            count = 2.0 * kept[:, device].sum()
+            taken = _trace(_normal(p, model, rows, own, priors=False), normal, inverse)
+            redundancy = max(count - taken, 0.1 * count, 1.0)
             # psi = w s; its mean square over the square of its mean slope is what the estimate loses (Huber 7.6).
-            w, t = weight[kept, device], s[kept, device]
-            slope = w - 2 * np.sqrt(w) * np.square(t / TUKEY)
-            mean_square = np.square(w * t).sum() / 2 / max(len(t), 1)
-            ratio = mean_square / max(float(np.mean(slope)), 0.1) ** 2 if len(t) else 1.0
-            effective[device] = scales[device] * math.sqrt(max(ratio, 0.0) * count / max(redundancy, 1e-9))
-            effective[device] = max(effective[device], LEAST_SCALE_PX)
-            spread = np.square(t).sum() / max(redundancy, 1e-9)
-            sigmas[device] = scales[device] * math.sqrt(spread)
-    covariance = np.zeros((24, 24))
-    scale = np.sqrt(np.abs(np.diag(information)))
-    inverse = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
-    covariance[np.ix_(free, free)] = (inverse + inverse.T) / 2
-    whole = np.zeros((24, 24))
-    whole[np.ix_(free, free)] = information
-    weighted = inverse_sigma**2 / effective**2 * weight
-    weighted[~seen, 1] = 0
+            w, t = weight[kept[:, device], device], s[kept[:, device], device]
+            if not len(t):
+                continue
+            slope = max(float(np.mean(w - 2 * np.sqrt(w) * np.square(t / TUKEY))), 0.1)
+            lost = float(np.square(w * t).sum()) / slope**2
+            effective[device] = max(scales[device] * math.sqrt(lost / redundancy), LEAST_SCALE_PX)
+            sigmas[device] = scales[device] * math.sqrt(float(np.square(t).sum()) / redundancy)
+    count = len(p.free)
+    own = inverse[:count, :count]
+    covariance, whole = np.zeros((24, 24)), np.zeros((24, 24))
+    covariance[np.ix_(p.free, p.free)] = own
+    whole[np.ix_(p.free, p.free)] = _inverse(own)
+    board = None
+    if p.board_sigma is not None:
+        # Of the board's coordinates so many are told by the views, the rest by the prior.
+        y = np.linalg.solve(normal.c, np.swapaxes(normal.b, 1, 2))
+        spread = np.einsum("vii->vi", np.linalg.inv(normal.c) + y @ inverse @ np.swapaxes(y, 1, 2))
+        told = np.maximum((1 - spread / p.board_sigma**2).sum(axis=0), 1e-6)
+        squares = np.square(model.shape).sum(axis=0)
+        board = math.sqrt(squares[:2].sum() / told[:2].sum()), math.sqrt(squares[2] / told[2])
+    weighted = p.inverse_sigma**2 / effective**2 * weight
     return Solution(
         model,
         covariance,
         rows.residuals[:, 0],
         np.where(seen[:, None], rows.raw_projector, np.nan),
-        weight > 0,
+        kept,
         (float(sigmas[0]), float(sigmas[1])),
-        free,
-        prior_sigma,
+        p.free,
+        p.prior,
         whole,
-        _without(f, rows, weighted, free, prior_sigma),
+        _without(p, model, rows, weighted),
+        board,
     )
 
 
-def _without(f: Features, rows: _Rows, weight: Floats, free: NDArray[np.intp], prior_sigma: Floats) -> Floats:
+def _inverse(information: Floats) -> Floats:
+    """Of a positive definite matrix whose units differ."""
+    scale = np.sqrt(np.maximum(np.abs(np.diag(information)), 1e-300))
+    out = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+    return np.asarray((out + out.T) / 2)
+
+
+def _trace(own: _Normal, whole: _Normal, inverse: Floats) -> float:
+    """How many parameters one device's rows determine: tr(N_own N^-1)."""
+    # N^-1 in blocks: C^-1 + Y S^-1 Y^T for the eliminated ones, -Y S^-1 across, with Y = C^-1 B^T.
+    y = np.linalg.solve(whole.c, np.swapaxes(whole.b, 1, 2))
+    ys = y @ inverse
+    total = float(np.sum(own.a * inverse))
+    total += float(np.sum(own.c * (np.linalg.inv(whole.c) + ys @ np.swapaxes(y, 1, 2))))
+    return total - 2 * float(np.sum(np.swapaxes(own.b, 1, 2) * ys))
+
+
+def _without(p: _Problem, model: Model, rows: _Rows, weight: Floats) -> Floats:
     """One Newton step from the solution of all views to that of all but one, for each."""
-    blocks = _blocks(f, rows, weight)
-    whole = blocks.reduced(free, prior_sigma)
-    views = len(blocks.c)
-    moved = np.zeros((views, 24))
-    for v in range(views):
-        own = _blocks(f.of([v]), rows.of(f.view == v), weight[f.view == v])
-        across = np.linalg.solve(own.c[0], np.column_stack([own.b[0].T, own.pose_gradient[0]]))
-        reduced = (own.a - own.b[0] @ across[:, :24])[np.ix_(free, free)]
-        gradient = (own.gradient - own.b[0] @ across[:, 24])[free]
-        rest = whole - reduced
-        scale = np.sqrt(np.maximum(np.diag(rest), 1e-300))
-        moved[v, free] = np.linalg.lstsq(rest / np.outer(scale, scale), gradient / scale, rcond=1e-12)[0] / scale
-    return moved
+    out = np.zeros((p.views, 24))
+    for view in range(p.views) if p.views > LEAST_VIEWS else ():
+        rest = [v for v in range(p.views) if v != view]
+        kept = p.f.view != view
+        fewer = p.of(rest)
+        normal = _normal(fewer, model.of(rest), rows.of(kept), weight[kept])
+        out[view] = _step(fewer, normal, 0.0)[0][:24]
+    return out
 
 
-def _trace(own: _Blocks, whole: _Blocks, free: NDArray[np.intp], prior_sigma: Floats) -> float:
-    """How many parameters one device's rows determine: tr(N_own N^-1), poses included."""
-    # N^-1 in blocks: poses' part C^-1 + Y S^-1 Y^T with Y = C^-1 B^T.
-    s = np.linalg.inv(whole.reduced(free, prior_sigma))
-    y = np.linalg.solve(whole.c, np.swapaxes(whole.b, 1, 2))[:, :, free]
-    c_inverse = np.linalg.inv(whole.c)
-    total = float(np.sum(own.a[np.ix_(free, free)] * s))
-    total += float(np.sum(own.c * (c_inverse + y @ s @ np.swapaxes(y, 1, 2))))
-    total -= 2 * float(np.einsum("vfp,vpf->", own.b[:, free], y @ s))
-    return total
+# --- the board's own shape --------------------------------------------------------------------------------------------
+
+# As throughout: five sigmas, so that chance says so once in two million times.
+Z = 5.0
+# Where the estimate of the board's own error starts, mm, and when it has settled.
+FIRST_MM, SETTLED = 0.03, 0.03
+MOST_ROUNDS = 10
+
+
+def repeats(f: Features, solved: Solution) -> bool:
+    """Whether the camera's residuals of a feature repeat from view to view: then the board is not as drawn.
+
+    The variance of the features' mean residuals, in the board's plane, against that within features (Fisher's F).
+    """
+    rows = rows_of(solved.model, f)
+    if rows is None:
+        return False
+    scale = rows.by_point[:, 0, :, :2]
+    used = solved.used[:, 0] & (np.abs(np.linalg.det(scale)) > 1e-9)
+    off = np.linalg.solve(scale[used], rows.residuals[used, 0][..., None])[..., 0]
+    number = f.number[used]
+    count = np.bincount(number, minlength=len(solved.model.shape)).astype(float)
+    sums = np.column_stack([np.bincount(number, off[:, i], minlength=len(count)) for i in (0, 1)])
+    means = sums / np.maximum(count, 1)[:, None]
+    several = count >= 2
+    between = 2.0 * several.sum()
+    within = 2.0 * float((count[several] - 1).sum())
+    if not (several.any() and within > 0):
+        return False
+    kept = several[number]
+    noise = float(np.square(off[kept] - means[number[kept]]).sum()) / within
+    repeated = float((count[several, None] * np.square(means[several])).sum()) / between
+    return bool(repeated > noise * (1 + Z * math.sqrt(2 / between + 2 / within)))
+
+
+def solve_with_board(f: Features, solved: Solution, *, k3: bool = False) -> Solution:
+    """The adjustment with the board's shape, its prior's widths as the data have them."""
+    widths = FIRST_MM, FIRST_MM
+    for _ in range(MOST_ROUNDS):
+        before = widths
+        solved = solve(f, solved.model, solved.prior_sigma, k3=k3, board_sigma_mm=before)
+        assert solved.board_sigma_mm is not None
+        widths = max(solved.board_sigma_mm[0], 1e-5), max(solved.board_sigma_mm[1], 1e-5)
+        if all(abs(new / old - 1) < SETTLED for new, old in zip(widths, before, strict=True)):
+            break
+    return solved

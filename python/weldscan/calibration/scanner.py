@@ -88,6 +88,7 @@ def calibrate_scanner(
     board: str | Board | None = None,
     *,
     k3: bool = False,
+    board_shape: bool | None = None,
     temperature_c: float | None = None,
     valid_days: int = VALID_DAYS,
     progress: Progress | None = None,
@@ -98,6 +99,7 @@ def calibrate_scanner(
         folder: `weldscan-calibration/1` (docs/formats.md), or SLStudio's calseq folders.
         board: as `parse_board` reads it, `chessboard:9x13:10mm` for one; absent: what calibration.json says.
         k3: solve for the third radial term of both lenses; 0 otherwise.
+        board_shape: solve for how the board departs from its drawing; absent: where its residuals repeat.
         temperature_c: for the record; absent: what calibration.json says.
         valid_days: after how many days `inspect` says that the calibration is out of date.
         progress: called with (done, total, what).
@@ -149,7 +151,14 @@ def calibrate_scanner(
     assert size is not None
     projector = captures.spec.projector.width, captures.spec.projector.height
     found = solve_scanner(
-        views, size, projector, board=str(wanted), k3=k3, temperature_c=temperature, valid_days=valid_days
+        views,
+        size,
+        projector,
+        board=str(wanted),
+        k3=k3,
+        board_shape=board_shape,
+        temperature_c=temperature,
+        valid_days=valid_days,
     )
     return replace(found, left_out=tuple(left_out) + found.left_out, warnings=(*warnings, *found.warnings))
 
@@ -161,6 +170,7 @@ def solve_scanner(
     *,
     board: str = "",
     k3: bool = False,
+    board_shape: bool | None = None,
     temperature_c: float | None = None,
     valid_days: int = VALID_DAYS,
     date: datetime | None = None,
@@ -173,6 +183,7 @@ def solve_scanner(
         projector_size: width, height.
         board: its name, for the record.
         k3: solve for the third radial term of both lenses.
+        board_shape: solve for how the board departs from its drawing; absent: where its residuals repeat.
         temperature_c: for the record.
         valid_days: how long it is valid.
         date: of the calibration; now, by default.
@@ -198,6 +209,8 @@ def solve_scanner(
     for _ in range(2 if any(view.diameter_mm for view in checked) else 0):
         f = _without_bias(_features(checked), checked, solved.model)
         solved = bundle.solve(f, solved.model, priors, k3=k3)
+    if board_shape or (board_shape is None and bundle.repeats(f, solved)):
+        solved = bundle.solve_with_board(f, solved, k3=k3)
     return _result(checked, f, solved, linked, camera_size, projector_size, board, temperature_c, valid_days, date)
 
 
@@ -370,13 +383,17 @@ def _features(views: Sequence[BoardView]) -> bundle.Features:
     typical = float(np.nanmedian(spread)) if np.isfinite(spread).any() else 1.0
     # What the phase's noise does not explain is the same for all: nobody counts for more than a typical feature.
     relative = np.maximum(np.where(np.isfinite(spread), spread, typical) / max(typical, 1e-12), 1.0)
+    board = np.concatenate([v.board_mm for v in views])
+    # Views share a board: what has the same place on it is the same feature.
+    _, number = np.unique(np.rint(board / 1e-6), axis=0, return_inverse=True)
     return bundle.Features(
         np.repeat(np.arange(len(views)), [len(v.camera_px) for v in views]),
-        np.concatenate([v.board_mm for v in views]),
+        board,
         np.concatenate([v.camera_px for v in views]),
         np.concatenate([v.projector_px for v in views]),
         np.concatenate([np.zeros((len(v.camera_px), 2, 2)) if v.slope is None else v.slope for v in views]),
         relative,
+        np.asarray(number, dtype=np.intp).ravel(),
     )
 
 
@@ -441,6 +458,7 @@ def _result(
             for name, i in zip(where.NAMES, where.SHOWN, strict=True)
         ),
         coverage=(coverage[0], coverage[1]),
+        board_sigma_mm=solved.board_sigma_mm,
         jackknife_mm=jackknife,
         shape_u_mm=shape,
         undetermined=tuple(name for name, _ in undetermined),
@@ -587,6 +605,12 @@ def _warnings(
         lost = float((~solved.used[counted, column]).mean())
         if lost > REJECTED_SHARE:
             out.append(f"{lost:.0%} of the {name}'s features were rejected as outliers")
+    if found.board_sigma_mm is not None:
+        inside, outside = found.board_sigma_mm
+        out.append(
+            f"the board departs from its drawing by {inside:.3f} mm in its plane and {outside:.3f} mm out of it (one "
+            "coordinate, rms): this was solved for"
+        )
     typical = np.nanmedian([pose.rms_px for pose in found.poses], axis=0)
     for pose in found.poses:
         for column, name in ((0, "camera"), (1, "projector")):

@@ -171,7 +171,15 @@ def best_pose(
             for around in AROUND_DEG if tilt else (0.0,):
                 lean = math.radians(around)
                 turn = rotation(math.radians(tilt) * np.array([-math.sin(lean), math.cos(lean), 0.0]))
-                trial = Model(model.camera, model.projector, model.turn, model.shift, turn[None], target[None])
+                trial = Model(
+                    model.camera,
+                    model.projector,
+                    model.turn,
+                    model.shift,
+                    turn[None],
+                    target[None],
+                    np.zeros_like(board),
+                )
                 features = Features(
                     np.zeros(len(board), dtype=np.intp),
                     board,
@@ -179,6 +187,7 @@ def best_pose(
                     np.zeros((len(board), 2)),
                     np.zeros((len(board), 2, 2)),
                     np.ones(len(board)),
+                    np.arange(len(board)),
                 )
                 rows = rows_of(trial, features)
                 if rows is None:
@@ -186,13 +195,13 @@ def best_pose(
                 seen = _inside(rows.residuals[:, 0], camera_size) & _inside(rows.raw_projector, projector_size)
                 if seen.mean() < LEAST_IN_VIEW:
                     continue
-                by_globals, by_pose = rows.by_globals[seen], rows.by_pose[seen]
+                by_lenses, by_pose = rows.by_lenses[seen], rows.by_pose[seen]
                 if slopes_known:
                     slope = _slope(by_pose)
-                    by_globals[:, 1] -= slope @ by_globals[:, 0]
+                    by_lenses[:, 1] -= slope @ by_lenses[:, 0]
                     by_pose[:, 1] -= slope @ by_pose[:, 0]
                 scale = (math.sqrt(gain) / sigma)[None, :, None, None]
-                g, p = (by_globals * scale).reshape(-1, 24), (by_pose * scale).reshape(-1, 6)
+                g, p = (by_lenses * scale).reshape(-1, 24), (by_pose * scale).reshape(-1, 6)
                 b, c = g.T @ p, p.T @ p
                 added = (g.T @ g - b @ np.linalg.solve(c, b.T))[np.ix_(free, free)]
                 information = solution.information[np.ix_(free, free)] + added

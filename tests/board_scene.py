@@ -14,7 +14,7 @@ import numpy as np
 from weldscan import Lens, Scanner
 from weldscan.calibration.board import Board
 
-FRINGES = (("x", 1, 4), ("x", 8, 4), ("x", 48, 4), ("y", 1, 4), ("y", 6, 4), ("y", 36, 4))
+FRINGES = (("x", 1, 3), ("x", 16, 3), ("y", 1, 3), ("y", 10, 3))
 DOTS_PER_MM = 10
 
 
@@ -83,7 +83,7 @@ def render(
 ) -> list[np.ndarray]:
     """The images of one pose, in the order of the fringes, 8 bits."""
     camera, projector = scanner.camera, scanner.projector
-    share = 3  # samples along each side of a pixel
+    share = 2  # samples along each side of a pixel
     at = (np.arange(camera.width * share) + 0.5) / share - 0.5, (np.arange(camera.height * share) + 0.5) / share - 0.5
     pixels = np.stack(np.meshgrid(*at), axis=-1).reshape(-1, 2)
     rays = np.column_stack([camera.undistort(pixels), np.ones(len(pixels))])

@@ -11,6 +11,7 @@ import platform
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, date, datetime
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,16 @@ from weldscan.manifest import left_out as left_out_of
 from weldscan.norms import judge, load_norm
 from weldscan.paper_method import paper_step
 from weldscan.points import PointReader, Progress
-from weldscan.result import BudgetLine, HandEye, Histogram, Inspection, PartCloud, ShotAgreement, StepResult
+from weldscan.result import (
+    BudgetLine,
+    HandEye,
+    Histogram,
+    Inspection,
+    PartCloud,
+    ScannerRecord,
+    ShotAgreement,
+    StepResult,
+)
 from weldscan.session import PartSpec, ShotSpec, read_session
 from weldscan.verification.history import standing_of
 
@@ -226,6 +236,7 @@ class _Run:
             for norm in self.norms
             for verdict in judge(norm, value, expanded, part, why_not_measured=reason, coverage_deg=coverage)
         ]
+        scanner = self.scanner_record()
         timing = self.read.timing
         timing["compute"] = sum(seconds for what, seconds in timing.items() if what != "read")
         return Inspection(
@@ -250,6 +261,32 @@ class _Run:
             },
             verification=self.standing,
             agreement=self.agreement,
+            scanner=scanner,
+        )
+
+    def scanner_record(self) -> ScannerRecord | None:
+        """Which calibration of the scanner this is, where the session says; with a warning where it is out of date."""
+        spec = self.session.scanner
+        if spec.id is None:
+            return None
+        expired = spec.valid_until is not None and date.fromisoformat(spec.valid_until) < datetime.now(UTC).date()
+        if expired:
+            self.read.warnings.append(
+                f"the scanner's calibration {spec.id} of {(spec.date or 'an unknown day')[:10]} was valid until "
+                f"{spec.valid_until}: it is out of date"
+            )
+        if spec.undetermined:
+            self.read.warnings.append(
+                f"the scanner's calibration {spec.id} did not determine {', '.join(spec.undetermined)}"
+            )
+        return ScannerRecord(
+            spec.id,
+            spec.date or "",
+            spec.valid_until,
+            expired,
+            spec.board,
+            spec.temperature_c,
+            spec.undetermined or (),
         )
 
     def paper_uncertainty_mm(self, step: StepResult, cloud: PartCloud | None, hand_eye: HandEye | None) -> float | None:

@@ -218,6 +218,21 @@ class Validation:
         return int(np.isfinite(self.distance_mm).sum())
 
 
+@dataclass(frozen=True)
+class ScannerRecord:
+    """The scanner's calibration that an inspection relied on, as its file says."""
+
+    id: str
+    date: str
+    valid_until: str | None
+    expired: bool
+    """On the day of the inspection."""
+    board: str | None
+    temperature_c: float | None
+    undetermined: tuple[str, ...]
+    """Parameters that its poses did not determine."""
+
+
 @dataclass(frozen=True, eq=False)
 class Inspection:
     """All of it. `step` is None where nothing could be measured; then `verdicts` say why."""
@@ -243,6 +258,8 @@ class Inspection:
     """What is on record about the scanner."""
     agreement: tuple[ShotAgreement, ...] = ()
     """Part shots that saw a wall together, held against each other."""
+    scanner: ScannerRecord | None = None
+    """Which calibration of the scanner was used; None where the session does not say."""
 
     @property
     def judged_mm(self) -> float | None:
@@ -289,6 +306,11 @@ class BoardPose:
     """How much the shape of the volume changes (rms) when the calibration does without this pose."""
     edge_px: float
     """How wide an edge of the board is in the image; NaN where unknown."""
+
+    @property
+    def missing(self) -> int:
+        """Features without a phase."""
+        return int(np.isnan(self.projector_px[:, 0]).sum())
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields
+from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar
 
@@ -98,6 +99,14 @@ def _non_zero(vector: Vector) -> Vector:
     return vector
 
 
+def _day(text: str) -> str:
+    """A date as YYYY-MM-DD."""
+    try:
+        return date.fromisoformat(text).isoformat()
+    except ValueError:
+        raise ValueError(f"{text!r} is not a day as YYYY-MM-DD") from None
+
+
 def _plain_name(name: str) -> str:
     """A name that is also a folder's: it can neither leave the session's folder nor hide in it."""
     if not re.fullmatch(r"[^\W_][\w .+-]{0,99}", name) or name[-1] in ". ":
@@ -162,7 +171,7 @@ class ScannerSpec(_Model):
     schema_: Annotated[Literal["weldscan-scanner/1"] | None, Field(alias="schema")] = None
     id: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     date: Annotated[str, Field(max_length=100)] | None = None
-    valid_until: Annotated[str, Field(pattern=r"^\d{4}-\d\d-\d\d$")] | None = None
+    valid_until: Annotated[str, AfterValidator(_day)] | None = None
     board: Annotated[str, Field(max_length=200)] | None = None
     board_sigma_mm: tuple[float, float] | None = None
     temperature_c: Annotated[float, Field(ge=-100, le=200)] | None = None

@@ -303,7 +303,9 @@ def _circles(image: Grey, board: Board) -> tuple[NDArray[np.intp], Floats, float
             continue
         rough = np.asarray(centres, dtype=np.float64).reshape(-1, 2)
         spacing = _spacing(board.points_mm(), rough, board)
-        fine = [_centroid(image, centre, spacing, dark) for centre in rough]
+        # Neighbours of an asymmetric grid lie across its diagonals.
+        apart = spacing * (math.sqrt(2) if board.kind == "acircles" else 1.0)
+        fine = [_centroid(image, centre, apart, dark) for centre in rough]
         if any(blob is None for blob in fine):
             continue
         blobs = np.array([blob for blob in fine if blob is not None])

@@ -231,19 +231,24 @@ def scanner(
     the board fills the whole image in turn.
     """
     from weldscan.calibration.scanner import calibrate_scanner
+    from weldscan.report.hand_eye import check_page
+    from weldscan.report.scanner import write_scanner_page
     from weldscan.session import read_scanner, write_scanner
 
+    page = out.with_suffix(".html")
     if out.exists():
         read_scanner(out)
+    check_page(page)
     with _progress() as progress:
         found = calibrate_scanner(
             folder, board, k3=k3, temperature_c=temperature, valid_days=valid_days, progress=progress
         )
     write_scanner(out, found)
-    _say(found, out)
+    write_scanner_page(found, page)
+    _say(found, out, page)
 
 
-def _say(found: ScannerCalibration, out: Path) -> None:
+def _say(found: ScannerCalibration, out: Path, page: Path) -> None:
     """A few lines: how good it is, what is missing, where it was kept."""
     camera, projector, both = found.rms_px
     print(
@@ -268,4 +273,5 @@ def _say(found: ScannerCalibration, out: Path) -> None:
             f"        add next: the board's middle at ({x:.0f}, {y:.0f}, {z:.0f}) mm, tilted by {add.tilt_deg:.0f}° "
             f"towards {add.around_deg:.0f}°: {add.lowers} from {add.from_value:.3g} to {add.to_value:.3g}"
         )
+    print(f"        page: {page}")
     print(f'        kept in {out}; a session carries it as "scanner": "{out.name}"')

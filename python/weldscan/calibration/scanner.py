@@ -417,7 +417,7 @@ def _result(
     model, free = solved.model, solved.free
     toward = -model.turn.T @ model.shift
     axis = "x" if abs(toward[0]) >= abs(toward[1]) else "y"
-    where = volume.volume_of(model, f, camera_size, projector_size)
+    where = volume.volume_of(model, f, projector_size)
     u, shape_u = volume.uncertainties(model, where, solved.covariance, axis)
     jacobian = volume.rigid_part(where.points) @ volume.point_jacobian(model, where.points, axis).reshape(-1, 24)
     moved = (solved.without @ jacobian.T).reshape(len(views), -1, 3)

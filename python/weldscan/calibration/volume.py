@@ -76,20 +76,21 @@ class Volume:
     )
 
 
-def volume_of(model: Model, f: Features, camera_size: tuple[int, int], projector_size: tuple[int, int]) -> Volume:
-    """The volume that the boards stood in: from the nearest to the furthest feature, as wide as both devices see.
+def volume_of(model: Model, f: Features, projector_size: tuple[int, int]) -> Volume:
+    """The volume that the boards filled: from the nearest to the furthest feature, as wide as the camera saw features.
 
-    Corners lie on the rays through the camera image's corners, drawn in until the projector sees them as well.
+    Corners are drawn in towards the middle until the projector sees them as well.
     """
     depth = np.einsum("nab,nb->na", model.turns[f.view], f.board_mm)[:, 2] + model.shifts[f.view][:, 2]
     near, far = (float(v) for v in np.quantile(depth, (0.02, 0.98)))
-    middle = np.array([(camera_size[0] - 1) / 2, (camera_size[1] - 1) / 2])
+    low, high = np.quantile(f.camera_px, (0.01, 0.99), axis=0)
+    middle, reach = (low + high) / 2, (high - low) / 2
     out = []
     for z in np.linspace(near, far, 3):
         for v in (-1, 0, 1):
             for u in (-1, 0, 1):
                 for share in np.linspace(1.0, 0.0, 41):
-                    pixel = middle + share * middle * np.array([u, v])
+                    pixel = middle + share * reach * np.array([u, v])
                     point = _on_ray(model.camera, pixel, z)
                     if share == 0 or _in_image(model, point[None], projector_size)[0]:
                         out.append(point)

@@ -112,6 +112,7 @@ def result_document(inspection: Inspection, created: datetime) -> dict[str, Any]
             {"name": line.name, "standard_mm": line.standard_mm, "derived_from": line.derived_from}
             for line in (step.budget if step else ())
         ],
+        "scanner": None if inspection.scanner is None else vars(inspection.scanner),
         "hand_eye": _hand_eye(hand_eye),
         "agreement": [vars(pair) for pair in inspection.agreement],
         "counts": counts(inspection.cloud),

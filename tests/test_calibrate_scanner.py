@@ -448,3 +448,56 @@ def test_real_skull_against_its_cloud(real):
     assert abs(np.median(off[:, 2])) <= 0.1
     # Their columns are whole pairs of projector columns: 0.25 mm in depth.
     assert np.median(np.abs(off[:, 2])) < 0.3
+
+
+# --- live -------------------------------------------------------------------------------------------------------------
+
+CELL = """
+[camera]
+backend = "simulated"
+board = "8x11:8mm"
+[projector]
+backend = "simulated"
+[calibration]
+count = 5
+temperature_c = 20.0
+"""
+
+
+def test_a_live_cell_is_captured_and_calibrated(tmp_path, monkeypatch, capsys):
+    """The project's own simulator renders the board, projector and camera are devices, an operator moves the board."""
+    import io
+
+    from weldscan.cli import main
+
+    (tmp_path / "cell.toml").write_text(CELL)
+    out = tmp_path / "scanner.json"
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n" * 5))
+    arguments = ["calibrate", "scanner", str(tmp_path / "captures"), "--live", "--config", str(tmp_path / "cell.toml")]
+    monkeypatch.setattr("sys.argv", ["weldscan", *arguments, "--board", "chessboard:8x11:8mm", "--out", str(out)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert not end.value.code
+    said = capsys.readouterr().out
+    assert "from 5 poses" in said
+    assert out.with_suffix(".html").read_text().startswith("<!doctype html>")
+    kept, truth = read_scanner(out), make_scanner()
+    assert kept.temperature_c == 20.0
+    built = kept.build()
+    assert built.camera.K[0, 0] == pytest.approx(truth.camera.K[0, 0], rel=0.003)
+    assert built.projector.K[0, 0] == pytest.approx(truth.projector.K[0, 0], rel=0.003)
+    assert shape_error_mm(built, truth).max() < 0.1
+
+
+def test_a_live_capture_without_an_operator_keeps_nothing(tmp_path, monkeypatch):
+    import io
+
+    from weldscan.cli import main
+
+    (tmp_path / "cell.toml").write_text(CELL)
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    arguments = ["calibrate", "scanner", str(tmp_path / "captures"), "--live", "--config", str(tmp_path / "cell.toml")]
+    monkeypatch.setattr("sys.argv", ["weldscan", *arguments, "--board", "chessboard:9x13:10mm"])
+    with pytest.raises(SystemExit):
+        main()
+    assert not (tmp_path / "captures").exists()

@@ -20,7 +20,7 @@ import typer
 
 from weldscan._weldcore import __version__
 from weldscan.calibration.cli import register as register_calibrations
-from weldscan.errors import NotMeasured, WeldscanError
+from weldscan.errors import InputError, NotMeasured, WeldscanError
 from weldscan.result import Verdict
 from weldscan.station.cli import register as register_cell
 
@@ -352,7 +352,20 @@ def _progress() -> Iterator[Progress]:
         yield show
 
 
-register_calibrations(app, _progress)
+def _capture_board(config: Path, folder: Path, board: str | None, progress: Progress) -> None:
+    """What `calibrate scanner --live` does before it calibrates."""
+    from weldscan.station.board import capture_board
+    from weldscan.station.cell import read_cell
+
+    def ask(what: str) -> None:
+        print(f"{what}, then press Enter.", file=sys.stderr, flush=True)
+        if not sys.stdin.readline():
+            raise InputError("--live: nobody is there to press Enter")
+
+    capture_board(read_cell(config), folder, board, progress, ask)
+
+
+register_calibrations(app, _progress, _capture_board)
 register_cell(app, _progress)
 
 

@@ -45,6 +45,19 @@ def fringe_patterns(fringes: Iterable[tuple[str, float, int]], width: int, heigh
             yield np.broadcast_to(level if axis == "x" else level[:, None], (height, width))
 
 
+def board_fringes(width: int, height: int) -> tuple[tuple[str, float, int], ...]:
+    """Return fringe sets along both axes for a scanner's calibration: periods of 20 px, what unwraps them, four steps.
+
+    >>> board_fringes(1280, 800)
+    (('x', 1, 4), ('x', 8, 4), ('x', 64, 4), ('y', 1, 4), ('y', 6, 4), ('y', 40, 4))
+    """
+    sets = []
+    for axis, size in (("x", width), ("y", height)):
+        finest = max(round(size / 20), 4)
+        sets += [(axis, periods, 4) for periods in (1, round(math.sqrt(finest)), finest)]
+    return tuple(sets)
+
+
 def flat_pattern(level: int, width: int, height: int) -> Pattern:
     """Return an even image, (height, width) uint8, read-only: 255 is white."""
     return np.broadcast_to(np.uint8(level), (height, width))

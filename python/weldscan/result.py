@@ -308,6 +308,11 @@ class BoardPose:
     """How wide an edge of the board is in the image; NaN where unknown."""
 
     @property
+    def kept(self) -> tuple[int, int]:
+        """How many features were used, camera and projector."""
+        return int(self.used[:, 0].sum()), int(self.used[:, 1].sum())
+
+    @property
     def missing(self) -> int:
         """Features without a phase."""
         return int(np.isnan(self.projector_px[:, 0]).sum())

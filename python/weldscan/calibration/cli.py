@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from weldscan.errors import InputError
+
 if TYPE_CHECKING:
     from weldscan.calibration.plan import Plan
     from weldscan.result import HandEye, ScannerCalibration
@@ -29,13 +31,22 @@ def _silent() -> Iterator[Tell]:
     yield lambda done, of, what: None
 
 
+Capture = Callable[[Path, Path, str | None, Tell], None]
+"""Captures a board by a cell's devices: cell.toml, the folder to make, the board, progress."""
+
+
+def _no_devices(config: Path, folder: Path, board: str | None, tell: Tell) -> None:
+    raise InputError("--live: this program has no devices")
+
+
 _progress: Progress = _silent
+_capture: Capture = _no_devices
 
 
-def register(app: typer.Typer, progress: Progress = _silent) -> None:
-    """Add `calibrate`; `progress` gives what shows how far a calibration is."""
-    global _progress  # noqa: PLW0603 - set once, when the command line is put together
-    _progress = progress
+def register(app: typer.Typer, progress: Progress = _silent, capture: Capture = _no_devices) -> None:
+    """Add `calibrate`; `progress` gives what shows how far a calibration is, `capture` what `--live` does."""
+    global _progress, _capture
+    _progress, _capture = progress, capture
     app.add_typer(calibrate, name="calibrate")
 
 
@@ -222,14 +233,20 @@ def scanner(
         "scanner.json"
     ),
     k3: Annotated[bool, typer.Option("--k3", help="Solve for the third radial term of both lenses.")] = False,
+    flat: Annotated[bool, typer.Option("--flat", help="Take the board as exactly as drawn.")] = False,
     temperature: Annotated[float | None, typer.Option(help="Of the scanner, °C, for the record.")] = None,
     valid_days: Annotated[int, typer.Option(min=1, help="After how many days it is out of date.")] = 365,
+    live: Annotated[
+        bool, typer.Option("--live", help="Capture first, by the cell's devices; FOLDER must be new or empty.")
+    ] = False,
+    config: Annotated[Path, typer.Option(help="With --live: the cell's configuration.")] = Path("cell.toml"),
 ) -> None:
     """Calibrate camera and projector against a flat board, say how good it is, and which pose of the board to add.
 
     At least three poses, better ten to fifteen: tilted by 30 to 45 degrees to all sides, turned, near and far, so that
     the board fills the whole image in turn.
     """
+    from weldscan.calibration.board import parse_board
     from weldscan.calibration.scanner import calibrate_scanner
     from weldscan.report.hand_eye import check_page
     from weldscan.report.scanner import write_scanner_page
@@ -239,9 +256,19 @@ def scanner(
     if out.exists():
         read_scanner(out)
     check_page(page)
+    if board is not None:
+        parse_board(board)
     with _progress() as progress:
+        if live:
+            _capture(config, folder, board, progress)
         found = calibrate_scanner(
-            folder, board, k3=k3, temperature_c=temperature, valid_days=valid_days, progress=progress
+            folder,
+            board,
+            k3=k3,
+            board_shape=False if flat else None,
+            temperature_c=temperature,
+            valid_days=valid_days,
+            progress=progress,
         )
     write_scanner(out, found)
     write_scanner_page(found, page)

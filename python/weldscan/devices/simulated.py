@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from weldscan._weldcore import Lens, Scanner, SimulatedShot, simulate_shot, simulated_step
 from weldscan.errors import InputError
+from weldscan.fringes import board_fringes
 from weldscan.pose import KukaPose
 from weldscan.session import Frames, Session, write_session
 
@@ -52,6 +53,7 @@ class Surface:
 
 CERAMIC = Surface(albedo=0.78, specular=0.05, shininess=60.0)
 STEEL = Surface(albedo=0.42, specular=0.28, shininess=22.0, brushed=0.12)
+PAPER = Surface(albedo=0.8)
 ANODISED = Surface(albedo=0.4, specular=0.03, shininess=15.0)
 
 
@@ -394,6 +396,30 @@ class Cell:
 
 DEFAULT = Cell()
 """The demo: a 630x6 pipe whose walls are out of line by 0.47 mm, six shots of the plate, two of the weld."""
+
+
+@dataclass(frozen=True)
+class BoardCell(Cell):
+    """A cell for calibrating its scanner: a chessboard lies where the three-sphere plate was, fringes run both ways."""
+
+    fringes: tuple[tuple[str, float, int], ...] = board_fringes(1280, 800)
+    corners: tuple[int, int] = (8, 11)
+    square_mm: float = 8.0
+
+    def artefact_bodies(self) -> list[Body]:
+        """Return the board, a white rim of one square around its squares."""
+        squares = self.corners[0] + 1, self.corners[1] + 1
+        size = ((squares[0] + 2) * self.square_mm, (squares[1] + 2) * self.square_mm, 8.0)
+        return [Body(Block(size, squares, self.square_mm), np.asarray(self.base_from_plate), PAPER, PLATE)]
+
+    def board_views(self, count: int) -> list[Floats]:
+        """Return base_from_scanner per pose: tilted to all sides, rolled, near and far, and aside."""
+        top, reach = placed((0.0, 0.0, 4.0)), 1.0 * self.square_mm
+        views = []
+        for i, view in enumerate(tilted_views(np.asarray(self.base_from_plate) @ top, count)):
+            aside = (math.cos(2.4 * i) * reach, math.sin(2.4 * i) * reach, 0.0)
+            views.append(view @ placed(aside))
+        return views
 
 
 # --- a session --------------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError
 from weldscan.devices import BACKENDS, backend
 from weldscan.devices.camera import Camera, CameraSettings
 from weldscan.devices.projector import Projector, ProjectorSettings
-from weldscan.devices.simulated import DEFAULT, Cell, render
+from weldscan.devices.simulated import DEFAULT, BoardCell, Cell, render
 from weldscan.errors import DeviceError, InputError
 from weldscan.fringes import fringe_patterns
 from weldscan.session import explain
@@ -64,6 +64,9 @@ class VirtualCameraSettings(CameraSettings):
     """A robot section: the simulated controller that carries this camera; empty: it stands at the first part pose."""
     nominal_exposure_s: Annotated[float, Field(gt=0)] = 1 / 30
     """The exposure that the simulated cell is lit for."""
+    board: Annotated[str | None, Field(pattern=r"^\d+x\d+:\d+(\.\d+)?mm$")] = None
+    """A chessboard lies in the cell, `9x13:10mm`: inner corners and square. Without a controller somebody moves it on
+    after every whole stack of fringes."""
     cell: Any = None
     """A `weldscan.devices.simulated.Cell`, where a program makes the configuration; absent: the demo's."""
 
@@ -76,6 +79,11 @@ class VirtualCamera(Camera):
 
     def __init__(self, settings: VirtualCameraSettings) -> None:
         cell: Cell = DEFAULT if settings.cell is None else settings.cell
+        if settings.board is not None:
+            size, square = settings.board.removesuffix("mm").split(":")
+            columns, rows = map(int, size.split("x"))
+            cell = BoardCell(corners=(columns, rows), square_mm=float(square))
+        self._stacks = 0
         self.settings, self.cell = settings, cell
         self.name = "simulated camera"
         self._patterns = list(
@@ -116,6 +124,7 @@ class VirtualCamera(Camera):
         for index, pattern in enumerate(self._patterns):
             if shown.shape == pattern.shape and np.array_equal(shown, pattern):
                 image: NDArray[Any] = shot.frames[0][index]
+                self._stacks += index == len(self._patterns) - 1
                 return image
         level = int(shown.flat[0])
         if not (shown == level).all():
@@ -126,7 +135,9 @@ class VirtualCamera(Camera):
     def _render(self) -> Any:
         """Render all patterns from here at this exposure at once, and keep them while nothing moves."""
         cell = self.cell
-        if self._robot is None:
+        if self._robot is None and isinstance(cell, BoardCell):
+            base_from_scanner = cell.board_views(self._stacks + 1)[-1]
+        elif self._robot is None:
             base_from_scanner = cell.part_views()[0]
         else:
             base_from_scanner = self._robot.pose().flange.matrix() @ np.asarray(cell.flange_from_scanner)

@@ -31,6 +31,8 @@ class CellConfig(BaseModel):
     camera: dict[str, Any] | None = None
     projector: dict[str, Any] | None = None
     scan: dict[str, Any] = {}
+    calibration: dict[str, Any] = {}
+    """How `weldscan calibrate scanner --live` goes about it."""
     verification: dict[str, Any] | None = None
     """The limits of `weldscan verify`, which checks them."""
     _path: Path = Path("cell.toml")

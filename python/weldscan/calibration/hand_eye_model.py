@@ -30,9 +30,8 @@ Floats = NDArray[np.float64]
 # The factors: sphere fits, the pose's place, the pose's direction, each touch's own error, the bias that all share.
 SPHERE, PLACE, DIRECTION, TOUCH, BIAS = range(5)
 # Within which factor each standard uncertainty is believed beforehand, two times out of three. A fit states a sphere's
-# from its own residuals. Robot and touch go by data sheets and rules of thumb, and the length of a probe by whoever
-# measured it last.
-BELIEVED = np.array([1.25, 2.0, 2.0, 2.0, 3.0])
+# from its own residuals; robot and probe go by data sheets and rules of thumb.
+BELIEVED = np.array([1.25, 2.0, 2.0, 2.0, 2.0])
 FACTORS = len(BELIEVED)
 # The same for the logarithm of a variance.
 WIDTH = 2 * np.log(BELIEVED)

@@ -525,6 +525,16 @@ def test_balls_of_another_diameter_show_as_size(session, found, tmp_path):
     assert other["PF"].value_mm == pytest.approx(found["PF"].value_mm, abs=0.01)
 
 
+def test_a_wrong_lens_shows_as_flatness(session, found, tmp_path):
+    def change(document):
+        document["scanner"]["camera"]["dist"][0] += 0.2
+        only("plane")(document)
+
+    bent = verify(edited(session, tmp_path / "bent", change), {"f_mm": 0.001})
+    assert bent["F"].verdict is Verdict.FAIL and bent["F"].mean_mm > 2 * found["F"].mean_mm
+    assert bent["PF"].verdict is Verdict.NOT_ASSESSABLE
+
+
 def only(*kinds: str):
     def change(document):
         document["shots"] = [shot for shot in document["shots"] if shot["of"] in kinds]

@@ -123,9 +123,10 @@ def judge_characteristic(
     elif value is not None and abs(value) > limit + guard:
         verdict, reason = Verdict.FAIL, f"{abs(value):.4f} mm is more than {limit:g} + {guard:.4f} mm"
     elif lost:
-        verdict, reason = Verdict.NOT_MEASURED, f"not measured everywhere: {'; '.join(lost)}"
+        more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
+        verdict, reason = Verdict.NOT_MEASURED, f"not measured at every position: {lost[0]}{more}"
     elif not finite:
-        verdict, reason = Verdict.NOT_MEASURED, "no value" if not values.size else "a value is not a number"
+        verdict, reason = Verdict.NOT_MEASURED, "no shot shows it" if not values.size else "a value is not a number"
     elif positions < required:
         verdict, reason = Verdict.NOT_MEASURED, f"{positions} distinct positions; {required} are needed"
     elif not math.isfinite(guard) or value is None or abs(value) > limit - guard:

@@ -687,6 +687,8 @@ def test_what_a_session_may_rely_on(session, tmp_path, verdict, day, scanner, sa
     append_history(path, made_up(verdict, day=day, scanner=scanner or mine))
     standing = standing_of(read, path)
     assert standing.good == (says is None) and (says is None or says in standing.text)
+    # What was made up was verified with fringes that nobody knows.
+    assert any("verified with fringes unknown, this session has x 1 x 4" in n for n in standing.notes) == (not scanner)
     accepted = standing_of(read, path, "checked by hand")
     assert accepted.relied_on and "checked by hand" in accepted.statement
     with pytest.raises(InputError, match="give the reason"):
@@ -706,6 +708,12 @@ def test_a_history_that_was_changed_is_not_relied_upon(session, tmp_path, three_
     with path.open("ab") as file:
         file.write(three_lines[:200])
     assert standing_of(read, path).good and "unfinished" in standing_of(read, path).notes[0]
+
+
+def test_a_session_with_the_fringes_of_the_verification_needs_no_note(session, found, tmp_path):
+    append_history(tmp_path / "v.jsonl", found)
+    standing = standing_of(read_session(session), tmp_path / "v.jsonl")
+    assert standing.good and standing.notes == () and "PF, PS, SD, F" in standing.text
 
 
 def test_where_the_history_is_looked_for(session, tmp_path):

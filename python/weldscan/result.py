@@ -560,6 +560,8 @@ class Verification:
     warnings: tuple[str, ...]
     limits: dict[str, Any]
     software: dict[str, str]
+    fringes: str = ""
+    """What was projected: a verification is about these."""
     drift: tuple[Drift, ...] = ()
     """Over the verifications in the history, where one is kept."""
     notes: tuple[str, ...] = ()

@@ -64,6 +64,7 @@ def document(found: Verification, created: datetime) -> dict[str, Any]:
         "created": created.isoformat(timespec="seconds"),
         "session": found.session,
         "scanner": found.scanner,
+        "fringes": found.fringes,
         "date": found.date,
         "date_from": found.date_from,
         "valid_until": found.valid_until,

@@ -176,6 +176,11 @@ def scanner_id(scanner: ScannerSpec) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+def fringes_of(session: Session) -> str:
+    """The fringe sets in a line: axis, periods and steps of each."""
+    return ", ".join(f"{fringe.axis} {fringe.periods:g} x {fringe.steps}" for fringe in session.fringes)
+
+
 def moment(text: str, where: str) -> datetime:
     """A date or time in ISO 8601; UTC where it names no zone."""
     try:
@@ -302,6 +307,7 @@ def verify(
         assumed=assumed,
         warnings=tuple(read.warnings),
         limits=kept.model_dump(exclude={"history"}),
+        fringes=fringes_of(session),
         software={
             "name": "weldscan",
             "version": __version__,

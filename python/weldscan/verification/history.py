@@ -25,7 +25,7 @@ from weldscan.errors import InputError
 from weldscan.manifest import sync_folder
 from weldscan.result import Drift, Standing, Verdict, Verification
 from weldscan.session import Session, plain
-from weldscan.verification import CLOCK_SKEW, moment, scanner_id
+from weldscan.verification import CLOCK_SKEW, fringes_of, moment, scanner_id
 
 try:
     import fcntl
@@ -78,6 +78,8 @@ class Record(BaseModel):
     session: str
     session_sha256: str
     software: str
+    fringes: str
+    limits: dict[str, Any]
     characteristics: dict[str, KeptCharacteristic]
     prev: str | None
     """`id` of the line before it."""
@@ -276,6 +278,8 @@ def _record(found: Verification, prev: str | None) -> Record:
             "session": found.session,
             "session_sha256": found.software.get("session_sha256", ""),
             "software": found.software.get("version", ""),
+            "fringes": found.fringes,
+            "limits": found.limits,
             "characteristics": {
                 each.name: {
                     "value_mm": each.value_mm,
@@ -413,6 +417,11 @@ def standing_of(
         why = f"the last verification, of {last.date}, ended in {last.verdict}"
     elif moment(last.valid_until, "valid_until") < now:
         why = f"the verification of {last.date} expired on {last.valid_until}"
+    notes = list(found.notes)
+    if last is not None and last.fringes != fringes_of(session):
+        notes.append(
+            f"the scanner was verified with fringes {last.fringes or 'unknown'}, this session has {fringes_of(session)}"
+        )
     text = why or ""
     if last is not None and why is None:
         judged = ", ".join(name for name, each in last.characteristics.items() if each.verdict is Verdict.PASS)
@@ -425,7 +434,7 @@ def standing_of(
         date=last.date if last else None,
         valid_until=last.valid_until if last else None,
         accepted=accept,
-        notes=found.notes,
+        notes=tuple(notes),
     )
 
 

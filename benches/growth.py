@@ -287,7 +287,8 @@ def plot(found: dict[str, dict[int, float]]) -> str:
         out.append(f'<text x="{x(n):.1f}" y="{HEIGHT - BOTTOM + 18}" text-anchor="middle">1e{power}</text>')
     for power in range(low, high + 1):
         out.append(f'<path class="grid" d="M{LEFT} {y(10.0**power):.1f}H{WIDTH - RIGHT}"/>')
-        label = f"{10.0**power:g} s" if power >= 0 else f"{10 ** (power + 3):g} ms" if power >= -3 else f"1e{power} s"
+        unit, factor = ("s", 1) if power >= 0 else ("ms", 1e3) if power >= -3 else ("µs", 1e6)
+        label = f"{10.0**power * factor:g} {unit}"
         out.append(f'<text x="{LEFT - 8}" y="{y(10.0**power) + 4:.1f}" text-anchor="end">{label}</text>')
     middle = (LEFT + WIDTH - RIGHT) / 2
     out.append(f'<text x="{middle:.0f}" y="{HEIGHT - 10}" text-anchor="middle">points, queries or pixels</text>')
@@ -302,8 +303,8 @@ def plot(found: dict[str, dict[int, float]]) -> str:
         ends.append((y(runs[last]), x(last), name, look))
     # Names beside the ends of their lines, moved apart.
     at = TOP - 6.0
-    for height, end, name, look in sorted(ends):
-        at = max(at + 15, min(height, HEIGHT - BOTTOM - 15 * (len(ends) - 1)))
+    for i, (height, end, name, look) in enumerate(sorted(ends)):
+        at = max(at + 15, min(height, HEIGHT - BOTTOM - 15 * (len(ends) - 1 - i)))
         edge = WIDTH - RIGHT
         out.append(f'<path {look} stroke-opacity=".6" d="M{end:.1f} {height:.1f}L{edge + 12} {at:.1f}H{edge + 28}"/>')
         out.append(f'<text x="{edge + 34}" y="{at + 4:.1f}">{name}</text>')

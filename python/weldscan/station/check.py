@@ -37,7 +37,9 @@ class Pixels:
 
 
 def latency_s(camera: Camera, projector: Projector, repeats: int = 5) -> tuple[float, ...]:
-    """Return, per repeat, seconds from `show` until a frame began that shows nothing of the pattern before."""
+    """Return, per repeat, seconds from `show` until a frame had begun for certain that shows nothing of the pattern
+    before: its exposure was over when the frame was there. Never too short, however late the machine is.
+    """
     black, white = _flats(camera, projector)
     low, high = float(black.mean()), float(white.mean())
     if high - low < LEAST_CONTRAST * full_scale(white):
@@ -47,11 +49,11 @@ def latency_s(camera: Camera, projector: Projector, repeats: int = 5) -> tuple[f
         _show(projector, 0, REST_S)
         shown_s = projector.show(_flat(projector, 255))
         while True:
-            began_s = time.monotonic()
-            if began_s - shown_s > LONGEST_LATENCY_S:
+            if time.monotonic() - shown_s > LONGEST_LATENCY_S:
                 raise DeviceTimeout(f"{projector.name}: no white within {LONGEST_LATENCY_S:g} s")
-            if camera.capture().image.mean() >= low + ARRIVED * (high - low):
-                found.append(began_s - shown_s)
+            frame = camera.capture()
+            if frame.image.mean() >= low + ARRIVED * (high - low):
+                found.append(max(frame.time_s - camera.exposure_s - shown_s, 0.0))
                 break
     return tuple(found)
 

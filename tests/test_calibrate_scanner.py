@@ -501,3 +501,44 @@ def test_a_live_capture_without_an_operator_keeps_nothing(tmp_path, monkeypatch)
     with pytest.raises(SystemExit):
         main()
     assert not (tmp_path / "captures").exists()
+
+
+# --- what an inspection makes of it -----------------------------------------------------------------------------------
+
+
+def test_an_inspection_states_the_scanners_calibration(tmp_path):
+    from weldscan import inspect, read_session
+    from weldscan.devices.simulated import DEFAULT, simulate_session
+    from weldscan.report import result_document
+
+    folder = tmp_path / "session"
+    simulate_session(folder, replace(DEFAULT, robot=None, artefact_shots=0, part_at_deg=(166.0,)))
+    document = json.loads((folder / "session.json").read_text())
+    scanner = document["scanner"]
+    kept = {
+        **scanner,
+        "schema": "weldscan-scanner/1",
+        "id": "7a96",
+        "date": "2020-03-01T00:00:00+00:00",
+        "valid_until": "2021-03-01",
+        "undetermined": ["projector.fx"],
+        "temperature_c": 20.5,
+    }
+    (folder / "scanner.json").write_text(json.dumps(kept))
+    (folder / "session.json").write_text(json.dumps({**document, "scanner": "scanner.json"}))
+    assert read_session(folder).scanner.id == "7a96"
+    found = inspect(folder)
+    assert found.scanner is not None
+    assert found.scanner.expired
+    assert any("7a96 of 2020-03-01 was valid until 2021-03-01: it is out of date" in w for w in found.warnings)
+    assert any("did not determine projector.fx" in w for w in found.warnings)
+    from datetime import UTC, datetime
+
+    assert result_document(found, datetime.now(UTC))["scanner"]["id"] == "7a96"
+    (folder / "session.json").write_text(json.dumps({**document, "scanner": "../scanner.json"}))
+    with pytest.raises(InputError, match="not a file inside the session's folder"):
+        read_session(folder)
+    (folder / "scanner.json").write_text(json.dumps({**kept, "valid_until": "soon"}))
+    (folder / "session.json").write_text(json.dumps({**document, "scanner": "scanner.json"}))
+    with pytest.raises(InputError, match=r"scanner\.json: valid_until: 'soon' is not a day"):
+        read_session(folder)

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from weldscan.errors import InputError
-from weldscan.session import Session, ShotSpec, explain, read_text
+from weldscan.session import Session, ShotSpec, explain, parse_session, read_text
 
 SHOT, PLAN = "shot.json", "plan.json"
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
@@ -82,10 +82,7 @@ def left_out(folder: str | os.PathLike[str]) -> tuple[tuple[str, str], ...]:
 
 def read_plan(path: Path) -> Session:
     """Read a plan: a session document whose poses are where the flange shall go."""
-    try:
-        return Session.model_validate_json(read_text(path))
-    except ValidationError as error:
-        raise InputError(f"{path}: {explain(error)}") from None
+    return parse_session(path)
 
 
 def _planned(folder: Path) -> list[str]:

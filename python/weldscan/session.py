@@ -481,7 +481,7 @@ def read_session(folder: str | os.PathLike[str]) -> Session:
     path = folder / "session.json"
     if not folder.is_dir():
         raise InputError(f"{folder}: {'is not a folder' if folder.exists() else 'no such folder'}")
-    session = _parse(path, Session, folder)
+    session = parse_session(path)
     if isinstance(session.hand_eye, str):
         name = session.hand_eye
         inside = (folder / name).resolve()
@@ -494,6 +494,11 @@ def read_session(folder: str | os.PathLike[str]) -> Session:
         raise InputError(f"{path}: scanner: {error}") from None
     session._folder = folder
     return session
+
+
+def parse_session(path: Path) -> Session:
+    """A session's document, checked, without its hand-eye file and without its folder: a plan is one too."""
+    return _parse(path, Session, path.parent)
 
 
 def read_scanner(path: str | os.PathLike[str]) -> ScannerSpec:

@@ -194,6 +194,21 @@ def solve_scanner(
     Raises:
         InputError: a view's arrays are not as described, or the two devices see the board from different sides.
         GeometryError: fewer than three views, or they contradict each other.
+
+    Example:
+        >>> import numpy as np
+        >>> from weldscan import BoardView, solve_scanner
+        >>> from weldscan.calibration.board import parse_board
+        >>> from weldscan.devices.simulated import make_scanner, tilted_views
+        >>> truth, board = make_scanner(), parse_board("chessboard:8x11:8mm").points_mm()
+        >>> views = []
+        >>> for i, board_from_camera in enumerate(tilted_views(np.eye(4), 6)):
+        ...     points = (board - board_from_camera[:3, 3]) @ board_from_camera[:3, :3]
+        ...     both = truth.camera.project(points), truth.project_to_projector(points)
+        ...     views.append(BoardView(f"view {i}", board, *both))
+        >>> found = solve_scanner(views, (1280, 960), (1280, 800))
+        >>> abs(found.baseline_mm - truth.baseline_mm) < 1e-3, found.undetermined
+        (True, ())
     """
     checked = [_checked(view) for view in views]
     if len(checked) < LEAST_POSES:

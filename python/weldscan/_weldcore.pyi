@@ -14,6 +14,7 @@ __all__ = [
     "KdTree",
     "Lens",
     "Mesh",
+    "PhaseError",
     "PhaseMap",
     "Plane",
     "PlaneFit",
@@ -35,12 +36,15 @@ __all__ = [
     "decode_png",
     "distance",
     "estimate_normals",
+    "estimate_phase_error",
     "find_spheres",
     "fit_cylinder",
     "fit_plane",
     "fit_sphere",
+    "harmonics_of_gamma",
     "height_from_reference",
     "measure_step",
+    "phase_error_of_harmonics",
     "place_shots",
     "register_icp",
     "register_rigid",
@@ -114,6 +118,8 @@ class PhaseMap:
     @property
     def harmonics(self) -> list[float | None]: ...
     @property
+    def phase_error(self) -> list[PhaseError]: ...
+    @property
     def unwrapped_by(self) -> list[float]: ...
 
 def decode(
@@ -123,7 +129,28 @@ def decode(
     *,
     saturation: float | None = None,
     z: float = 5.0,
+    phase_error: Literal["auto"] | Sequence[Sequence[float] | None] | None = None,
 ) -> PhaseMap: ...
+
+# response
+@final
+class PhaseError:
+    @property
+    def steps(self) -> int: ...
+    @property
+    def sin_rad(self) -> list[float]: ...
+    @property
+    def standard_rad(self) -> list[float]: ...
+    @property
+    def source(self) -> str: ...
+    @property
+    def largest_rad(self) -> float: ...
+
+def estimate_phase_error(
+    phase_rad: ArrayLike, steps: int, *, z: float = 5.0, rows: int = 24
+) -> PhaseError | None: ...
+def phase_error_of_harmonics(harmonics: Sequence[float], steps: int) -> PhaseError: ...
+def harmonics_of_gamma(gamma: float) -> list[float]: ...
 
 @final
 class WrappedPhase:

@@ -14,7 +14,7 @@ from weldscan.devices.camera import Camera, Image
 from weldscan.devices.projector import Projector
 from weldscan.errors import DeviceError, DeviceTimeout
 from weldscan.fringes import flat_pattern
-from weldscan.response import Response, measured
+from weldscan.response import Response, response_of_ramp
 from weldscan.station.capture import full_scale, set_exposure
 
 LONGEST_LATENCY_S = 2.0
@@ -70,15 +70,12 @@ def response(camera: Camera, projector: Projector, levels: int = 18, frames: int
     for level in shown:
         _show(projector, int(level))
         light.append(float(np.mean([camera.capture().image[lit].mean() for _ in range(frames)])))
-    return measured(shown, light)
+    return response_of_ramp(shown, light)
 
 
 def gamma(response: Response) -> float:
     """Return the exponent of the power law that fits a response best: 1 is linear."""
-    level, light = np.asarray(response.level), np.asarray(response.light)
-    x, y = level / 255, (light - light[0]) / (light[-1] - light[0])
-    used = (x > 0.05) & (x < 1) & (y > 0.01)
-    return float(np.sum(np.log(x[used]) * np.log(y[used])) / np.sum(np.log(x[used]) ** 2))
+    return response.gamma
 
 
 def pixels(camera: Camera, projector: Projector) -> Pixels:

@@ -6,6 +6,7 @@ use std::f64::consts::TAU;
 
 use multiversion::multiversion;
 
+use super::response::{self, PhaseError, TERMS};
 use super::wave::{Lane, Level, Sinusoid, TILE, Wave, round, turns};
 use super::{FringeSet, Noise, Reason, Shot};
 use crate::unwrap::Plan;
@@ -291,6 +292,8 @@ pub(super) struct Decoder<'a, T> {
     shot: &'a Shot<'a, T>,
     /// First frame, number of steps, wave and limits of each set.
     sets: Vec<(usize, usize, Wave, Judge)>,
+    /// What is taken off each set's phase: steps and series.
+    errors: Vec<Option<(f32, [f32; TERMS])>>,
     chain: Chain,
 }
 
@@ -341,7 +344,13 @@ impl<'a, T: Level> Decoder<'a, T> {
             size: projector_size as f64,
             cyclic: plan.base.periods == 1.0 && sets.iter().all(|s| whole(s.periods)),
         };
-        Self { shot, sets: judged, chain }
+        Self { shot, sets: judged, errors: Vec::new(), chain }
+    }
+
+    /// Takes the projector's error off each set's phase.
+    pub(super) fn compensating(mut self, errors: &[PhaseError]) -> Self {
+        self.errors = errors.iter().map(PhaseError::in_turns).collect();
+        self
     }
 
     pub(super) fn tile(&self, start: usize, len: usize, work: &mut Work) {
@@ -355,6 +364,9 @@ impl<'a, T: Level> Decoder<'a, T> {
                 fuse(&work.fit, judge, e == 0, &mut why_set, set);
             }
             finish(self.chain.z, &why_set, set, &mut work.why);
+            if let Some(Some((steps, terms))) = self.errors.get(i) {
+                response::compensate(*steps, terms, &mut set.phase);
+            }
         }
         unwrap(&self.chain, work);
     }

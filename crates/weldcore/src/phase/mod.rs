@@ -12,6 +12,7 @@
 mod jumps;
 mod kernel;
 mod noise;
+mod response;
 mod wave;
 mod wrapped;
 
@@ -19,6 +20,7 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 pub use noise::{Noise, NoiseSource};
+pub use response::{ErrorSource, PhaseError, error_of_harmonics, harmonics_of_gamma, seen_in_phase};
 pub use wave::Level;
 pub(crate) use wave::{round, round64};
 pub use wrapped::{WrappedPhase, decode_phase};
@@ -51,18 +53,32 @@ pub struct Shot<'a, T> {
     pub height: usize,
 }
 
+/// What is done about the projector's response, see [`PhaseError`].
+#[derive(Debug, Clone, Default, PartialEq)]
+pub enum Compensation {
+    /// Nothing.
+    #[default]
+    Off,
+    /// The error that the shot's own phases show is taken off, where they show one above the noise.
+    Auto,
+    /// A known error per set.
+    Given(Vec<PhaseError>),
+}
+
 /// Settings of [`decode_shot`]. The defaults follow from noise and geometry.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct DecodeOptions {
     /// The level at which the camera saturates; `None`: see [`saturation_level`].
     pub saturation: Option<f64>,
     /// The safety factor z on sigma. At 5 noise alone decides one fringe order in two million wrongly.
     pub z: f64,
+    /// The projector's response.
+    pub compensation: Compensation,
 }
 
 impl Default for DecodeOptions {
     fn default() -> Self {
-        Self { saturation: None, z: 5.0 }
+        Self { saturation: None, z: 5.0, compensation: Compensation::Off }
     }
 }
 
@@ -110,6 +126,8 @@ pub struct PhaseMap {
     pub saturation: f64,
     /// Per set the rms of the higher harmonics over the first's amplitude; `None` with three steps, which show none.
     pub harmonics: Vec<Option<f64>>,
+    /// Per set the error that was taken off its phase, for the projector's response.
+    pub phase_error: Vec<PhaseError>,
     /// How the sets were unwrapped.
     pub plan: Plan,
 }
@@ -152,7 +170,13 @@ pub fn decode_shot<T: Level>(
     let plan = Plan::new(&sets.iter().map(|s| s.periods).collect::<Vec<_>>(), options.z)?;
     let saturation = options.saturation.unwrap_or_else(|| saturation_level(shot));
     let noise = noise::estimate(shot, sets, saturation as f32);
-    let decoder = Decoder::new(shot, sets, &plan, projector_size, noise, saturation as f32, options.z as f32);
+    let phase_error = match &options.compensation {
+        Compensation::Off => sets.iter().map(|s| PhaseError::none(s.steps)).collect(),
+        Compensation::Auto => response::seen_in_shot(shot, sets, &noise, saturation as f32, options.z),
+        Compensation::Given(errors) => errors.clone(),
+    };
+    let decoder = Decoder::new(shot, sets, &plan, projector_size, noise, saturation as f32, options.z as f32)
+        .compensating(&phase_error);
 
     let n = shot.width * shot.height;
     let mut map = PhaseMap {
@@ -167,6 +191,7 @@ pub fn decode_shot<T: Level>(
         noise,
         saturation,
         harmonics: harmonics(shot, sets, &noise, saturation as f32),
+        phase_error,
         plan: plan.clone(),
     };
     threads::install(|| {
@@ -230,6 +255,12 @@ fn validate<T>(shot: &Shot<'_, T>, sets: &[FringeSet], projector_size: usize, op
     if let Some(set) = sets.iter().find(|s| s.steps < 3) {
         let (expected, value) = ("3 or more".into(), set.steps.to_string());
         return Err(Error::OutOfRange { what: "steps of a fringe set", expected, value });
+    }
+    if let Compensation::Given(errors) = &options.compensation
+        && !errors.iter().map(|e| e.steps).eq(sets.iter().map(|s| s.steps))
+    {
+        let got = format!("{:?}", errors.iter().map(|e| e.steps).collect::<Vec<_>>());
+        return Err(Error::Shape { what: "phase_error", expected: "one per fringe set, of its steps".into(), got });
     }
     let needed: usize = sets.iter().map(|s| s.steps).sum();
     for frames in &shot.exposures {

@@ -15,6 +15,7 @@ mod image;
 mod kdtree;
 mod normals;
 mod phase;
+mod response;
 mod scanner;
 mod segment;
 mod simulate;
@@ -161,6 +162,7 @@ fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
     fit::register(m)?;
     scanner::register(m)?;
     phase::register(m)?;
+    response::register(m)?;
     triangulate::register(m)?;
     segment::register(m)?;
     kdtree::register(m)?;

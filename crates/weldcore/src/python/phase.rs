@@ -6,6 +6,7 @@ use numpy::{
 };
 use pyo3::prelude::*;
 
+use super::response::PyPhaseError;
 use super::{Whole, compute, float_matrix, floats, parts, raise, whole};
 use crate::error::Error;
 use crate::phase::{
@@ -50,6 +51,8 @@ pub(crate) struct PyPhaseMap {
     /// Per fringe set the rms of the higher harmonics over the amplitude (None with three steps, which show none).
     /// Above 0.05 or so the projector's gamma wants correcting.
     harmonics: Vec<Option<f64>>,
+    /// Per fringe set what was taken off its phase.
+    phase_error: Vec<Py<PyPhaseError>>,
     /// The chain of frequencies by which the fringes were counted, periods over the projector.
     unwrapped_by: Vec<f64>,
 }
@@ -71,7 +74,9 @@ impl PyPhaseMap {
 fn hand_over(py: Python<'_>, map: PhaseMap) -> PyResult<PyPhaseMap> {
     let (h, w) = (map.height, map.width);
     let chain = std::iter::once(map.plan.base.periods).chain(map.plan.links.iter().map(|l| l.signal.periods));
+    let errors = map.phase_error.iter().map(|e| Py::new(py, PyPhaseError::from(e)));
     Ok(PyPhaseMap {
+        phase_error: errors.collect::<PyResult<_>>()?,
         unwrapped_by: chain.collect(),
         column_px: image(py, map.column_px, h, w)?,
         sigma_px: image(py, map.sigma_px, h, w)?,
@@ -150,6 +155,9 @@ fn decode_as<T: Level + numpy::Element>(
 ///     saturation: level at which the camera saturates. Default: 255 for uint8; for uint16 the full scale of the narrowest
 ///         of 8, 10, 12, 14 and 16 bits that holds the largest value, after a shift by the low bits that are always zero.
 ///     z: safety factor on sigma, for what is dark and for fringe orders.
+///     phase_error: what is taken off each set's phase for the projector's response (gamma). None: nothing. "auto": what
+///         the phases themselves show above the noise, see `estimate_phase_error`. Or per set the coefficients of
+///         `sin(m steps phase)`, m = 1, 2 ..., rad (None: nothing).
 ///
 /// Returns:
 ///     PhaseMap: `column_px`, `sigma_px`, `modulation`, `background`, `reason` (H, W) and the noise model. Rejected pixels
@@ -178,7 +186,7 @@ fn decode_as<T: Level + numpy::Element>(
 ///     >>> bool(np.nanmax(np.abs(found.column_px - u)) < 0.1)
 ///     True
 #[pyfunction]
-#[pyo3(signature = (exposures, fringes, projector_size, *, saturation=None, z=5.0))]
+#[pyo3(signature = (exposures, fringes, projector_size, *, saturation=None, z=5.0, phase_error=None))]
 fn decode(
     py: Python<'_>,
     exposures: &Bound<'_, PyAny>,
@@ -186,6 +194,7 @@ fn decode(
     #[pyo3(from_py_with = whole)] projector_size: usize,
     saturation: Option<f64>,
     z: f64,
+    phase_error: Option<&Bound<'_, PyAny>>,
 ) -> PyResult<PyPhaseMap> {
     let wrong = |got: String| {
         let expected = "a list of stacks of (H, W) images".into();
@@ -203,7 +212,8 @@ fn decode(
     let fringes: Vec<(f64, Whole)> = parts("fringes", "a list of (periods, steps)", fringes)?;
     let sets: Vec<FringeSet> =
         fringes.into_iter().map(|(periods, steps)| FringeSet { periods, steps: steps.0 }).collect();
-    let options = DecodeOptions { saturation, z };
+    let options =
+        DecodeOptions { saturation, z, compensation: super::response::compensation(py, phase_error, &sets)? };
     let wide = stacks.first().and_then(|f| f.first()).is_some_and(|f| f.cast::<PyArray2<u16>>().is_ok());
     if wide {
         decode_as::<u16>(py, &stacks, &sets, projector_size, &options)

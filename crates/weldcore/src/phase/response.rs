@@ -1,0 +1,604 @@
+//! What a projector whose light is not proportional to its level does to the phase, seen in the images themselves.
+//!
+//! Harmonic p of the light is taken for the fundamental where p = mN ± 1. So the measured phase φ' of N steps errs by
+//! `Σ c_m sin(m N φ')`: sines alone, for light is an even function of the phase. Surfaces are smooth over a few pixels,
+//! the error is not: it repeats N times in a fringe. In the second difference over a lag of 0.4 of its wave,
+//! `φ'(x - l) - 2 φ'(x) + φ'(x + l)`, the surface is nearly gone, whole fringes drop out, and the coefficients stand in
+//! a robust linear fit. Its covariance is that of whole rows, so that what neighbouring pixels share is in it.
+
+use std::f64::consts::TAU;
+
+use multiversion::multiversion;
+use nalgebra::{SMatrix, SVector};
+use rayon::prelude::*;
+
+use super::kernel::demodulate;
+use super::wave::{Lane, Level, Sinusoid, TILE, Wave, round, turns};
+use super::{FringeSet, Noise, Shot};
+use crate::error::{Error, Result, require_positive};
+use crate::threads;
+
+/// Terms of the series: with three steps and a gamma of 2.2 the seventh is 0.5 mrad.
+pub const TERMS: usize = 6;
+/// Rows that are looked at: 24 of a usual camera give the first term to 0.2 mrad.
+const ROWS: usize = 24;
+/// Of the error's wave. At 0.4 no term but every fifth drops out of the second difference.
+const LAG: f64 = 0.4;
+/// Pixels over which a surface counts as smooth. A set with longer waves does not show its error.
+const LONGEST_LAG: f64 = 16.0;
+/// Fewer second differences say nothing.
+const FEWEST: usize = 1000;
+/// Reweighted solutions; Tukey's constant.
+const ITERATIONS: usize = 6;
+const TUKEY: f64 = 4.685;
+/// The median of |x| over the standard deviation of x.
+const MEDIAN_TO_SIGMA: f64 = 1.482_6;
+/// Harmonics of a power law that are kept.
+const HARMONICS: usize = 48;
+
+type Terms = SVector<f64, TERMS>;
+type Square = SMatrix<f64, TERMS, TERMS>;
+
+/// Where a set's error is known from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ErrorSource {
+    /// Nothing was seen above the noise.
+    Nothing,
+    /// The set's own phase.
+    Phase,
+    /// A finer set, for this one's waves are too long to be seen against the surface.
+    FinerSet,
+    /// The caller.
+    Given,
+}
+
+impl ErrorSource {
+    /// One word for it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Nothing => "nothing",
+            Self::Phase => "phase",
+            Self::FinerSet => "finer set",
+            Self::Given => "given",
+        }
+    }
+}
+
+/// The error of a measured phase φ' of `steps` steps: `Σ sin_rad[m - 1] sin(m steps φ')`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PhaseError {
+    /// Steps of the set.
+    pub steps: usize,
+    /// Coefficients, rad.
+    pub sin_rad: [f64; TERMS],
+    /// Their standard deviations; zero where they were given.
+    pub standard_rad: [f64; TERMS],
+    /// Where it is known from.
+    pub source: ErrorSource,
+}
+
+impl PhaseError {
+    /// No error.
+    pub fn none(steps: usize) -> Self {
+        Self { steps, sin_rad: [0.0; TERMS], standard_rad: [0.0; TERMS], source: ErrorSource::Nothing }
+    }
+
+    /// A known one.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for fewer than three steps, more than [`TERMS`] coefficients, one that is not finite, and
+    /// a series that no phase can have: two phases would be measured as one.
+    pub fn given(steps: usize, sin_rad: &[f64]) -> Result<Self> {
+        let wrong = |expected: String, value: String| Err(Error::OutOfRange { what: "phase_error", expected, value });
+        if steps < 3 {
+            return wrong("of 3 or more steps".into(), steps.to_string());
+        }
+        if sin_rad.len() > TERMS {
+            return wrong(format!("at most {TERMS} coefficients"), sin_rad.len().to_string());
+        }
+        if let Some(bad) = sin_rad.iter().find(|c| !c.is_finite()) {
+            return wrong("finite".into(), bad.to_string());
+        }
+        let mut terms = [0.0; TERMS];
+        terms.iter_mut().zip(sin_rad).for_each(|(t, c)| *t = *c);
+        let given = Self { sin_rad: terms, source: ErrorSource::Given, ..Self::none(steps) };
+        if !given.is_one_to_one() {
+            return wrong("a series that keeps the order of phases".into(), format!("{sin_rad:?}"));
+        }
+        Ok(given)
+    }
+
+    /// Is there anything to take off?
+    pub fn is_some(&self) -> bool {
+        self.source != ErrorSource::Nothing
+    }
+
+    /// The largest error of a phase, rad.
+    pub fn largest_rad(&self) -> f64 {
+        let error = |theta: f64| (1..).zip(&self.sin_rad).map(|(m, c)| c * (f64::from(m) * theta).sin()).sum::<f64>();
+        (0..128).map(|i| error(TAU * f64::from(i) / 128.0).abs()).fold(0.0, f64::max)
+    }
+
+    /// Does the true phase rise with the measured one everywhere?
+    fn is_one_to_one(&self) -> bool {
+        let slope = |theta: f64| {
+            let terms = (1..).zip(&self.sin_rad);
+            1.0 - terms.map(|(m, c)| f64::from(m) * self.steps as f64 * c * (f64::from(m) * theta).cos()).sum::<f64>()
+        };
+        (0..128).all(|i| slope(TAU * f64::from(i) / 128.0) > 0.0)
+    }
+
+    /// The coefficients as the kernel takes them: turns of turns.
+    pub(super) fn in_turns(&self) -> Option<(f32, [f32; TERMS])> {
+        self.is_some().then(|| (self.steps as f32, self.sin_rad.map(|c| (c / TAU) as f32)))
+    }
+}
+
+/// The rounding of a display's own levels makes errors of this size that repeat with the fringes: below it nothing is
+/// said about the response. An even error of one level in 256 over an amplitude of half the range, as σ_φ of N steps.
+fn display_rounding_rad(steps: usize) -> f64 {
+    (2.0 / steps as f64).sqrt() * (1.0 / 12f64.sqrt() / 255.0) / 0.5
+}
+
+/// sin and cos of 2πx to 4e-6, by Taylor's series at half the angle.
+#[inline(always)]
+fn sin_cos_turns(x: f32) -> (f32, f32) {
+    let h = std::f32::consts::PI * (x - round(x));
+    let z = h * h;
+    let s = 1.0 + z * (-1.0 / 6.0 + z * (1.0 / 120.0 + z * (-1.0 / 5040.0 + z * (1.0 / 362_880.0 - z / 39_916_800.0))));
+    let c = 1.0 + z * (-0.5 + z * (1.0 / 24.0 + z * (-1.0 / 720.0 + z * (1.0 / 40_320.0 - z / 3_628_800.0))));
+    let s = h * s;
+    (2.0 * s * c, 1.0 - 2.0 * s * s)
+}
+
+/// Takes the error off the phases of a tile, in turns.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+pub(super) fn compensate(steps: f32, terms: &[f32; TERMS], phase: &mut Lane) {
+    for p in phase.iter_mut() {
+        let (sin, cos) = sin_cos_turns(steps * *p);
+        // Clenshaw: Σ c_m sin(mθ).
+        let (mut one, mut two) = (0.0f32, 0.0f32);
+        for c in terms.iter().rev() {
+            (one, two) = (c + 2.0 * cos * one - two, one);
+        }
+        *p -= one * sin;
+    }
+}
+
+/// Looks for the error in the sets of a shot.
+pub(super) fn seen_in_shot<T: Level>(
+    shot: &Shot<'_, T>,
+    sets: &[FringeSet],
+    noise: &Noise,
+    saturation: f32,
+    z: f64,
+) -> Vec<PhaseError> {
+    let mut at = 0;
+    let mut found: Vec<Option<PhaseError>> = Vec::new();
+    for set in sets {
+        let (start, wave) = (at, Wave::new(set.steps));
+        at += set.steps;
+        let row = |y: usize| shot_row(shot, start, set.steps, &wave, noise, saturation, y);
+        found.push(seen_in_rows(shot.width, shot.height, &row, set.steps, z, ROWS));
+    }
+    // A coarse set cannot show its error; the next finer one of as many steps that shows one speaks for it.
+    let speaks = |set: &FringeSet| {
+        let same = sets.iter().zip(&found).filter(|(s, _)| s.steps == set.steps && s.periods > set.periods);
+        let seen = same.filter_map(|(s, f)| Some((s.periods, f.filter(PhaseError::is_some)?)));
+        seen.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, f)| PhaseError { source: ErrorSource::FinerSet, ..f })
+    };
+    let each = sets.iter().zip(&found);
+    each.map(|(set, own)| own.or_else(|| speaks(set)).unwrap_or(PhaseError::none(set.steps))).collect()
+}
+
+/// Looks for the error in one wrapped phase (row-major, rad; NaN where there is none) of `steps` steps, in `rows` rows
+/// spread over the image. `None` where its waves are too long, or too little of them is in view, to see any.
+///
+/// # Errors
+/// [`Error::Shape`] where the phase does not have that size, [`Error::OutOfRange`] for fewer than three steps or z ≤ 0.
+pub fn seen_in_phase(
+    phase_rad: &[f64],
+    width: usize,
+    steps: usize,
+    z: f64,
+    rows: usize,
+) -> Result<Option<PhaseError>> {
+    require_positive("z", z)?;
+    if steps < 3 {
+        return Err(Error::OutOfRange { what: "steps", expected: "3 or more".into(), value: steps.to_string() });
+    }
+    if width == 0 || phase_rad.is_empty() || !phase_rad.len().is_multiple_of(width) {
+        let got = format!("{} values, {width} in a row", phase_rad.len());
+        return Err(Error::Shape { what: "phase_rad", expected: "an image (H, W)".into(), got });
+    }
+    let row = |y: usize| {
+        let row = phase_rad.get(y * width..(y + 1) * width).unwrap_or_default();
+        row.iter().map(|p| if p.is_finite() { (p / TAU) as f32 } else { f32::NAN }).collect()
+    };
+    Ok(seen_in_rows(width, phase_rad.len() / width, &row, steps, z, rows.max(ROWS)))
+}
+
+/// The phase along a row of a shot, turns; NaN where the fringes do not stand clear of the noise in any exposure.
+fn shot_row<T: Level>(
+    shot: &Shot<'_, T>,
+    at: usize,
+    steps: usize,
+    wave: &Wave,
+    noise: &Noise,
+    saturation: f32,
+    y: usize,
+) -> Vec<f32> {
+    let mut row = vec![f32::NAN; shot.width];
+    let mut fit = Sinusoid::empty();
+    for (tile, out) in row.chunks_mut(TILE).enumerate() {
+        let (mut re, mut im) = ([0.0f32; TILE], [0.0f32; TILE]);
+        for frames in &shot.exposures {
+            let frames = frames.get(at..at + steps).unwrap_or_default();
+            demodulate(frames, y * shot.width + tile * TILE, out.len(), wave, &mut fit);
+            for i in 0..TILE {
+                let b2 = fit.re[i] * fit.re[i] + fit.im[i] * fit.im[i];
+                let level = noise.floor() as f32 + noise.gain as f32 * fit.background[i];
+                if fit.top[i] < saturation && b2 > 100.0 * level {
+                    re[i] += fit.re[i];
+                    im[i] += fit.im[i];
+                }
+            }
+        }
+        for (out, (&re, &im)) in out.iter_mut().zip(re.iter().zip(&im)) {
+            *out = if re == 0.0 && im == 0.0 { f32::NAN } else { turns(im, re) };
+        }
+    }
+    row
+}
+
+fn wrap(x: f32) -> f32 {
+    x - round(x)
+}
+
+fn median(values: &mut [f32]) -> Option<f32> {
+    if values.is_empty() {
+        return None;
+    }
+    let middle = values.len() / 2;
+    Some(*values.select_nth_unstable_by(middle, f32::total_cmp).1)
+}
+
+/// A second difference of the phase and of the series' sines.
+struct Sample {
+    phase: f32,
+    sines: [f32; TERMS],
+}
+
+impl Sample {
+    fn of(three: [f32; 3], steps: f32) -> Option<Self> {
+        let [a, b, c] = three;
+        let phase = wrap(wrap(a - b) - wrap(b - c));
+        if phase.is_nan() {
+            return None;
+        }
+        let mut sines = [0.0; TERMS];
+        for (turns, weight) in [(a, 1.0), (b, -2.0), (c, 1.0)] {
+            let (sin, cos) = sin_cos_turns(steps * turns);
+            let (mut before, mut now) = (0.0, sin);
+            for s in &mut sines {
+                *s += weight * now;
+                (before, now) = (now, 2.0 * cos * now - before);
+            }
+        }
+        Some(Self { phase, sines })
+    }
+}
+
+type Row<'a> = &'a (dyn Fn(usize) -> Vec<f32> + Sync);
+
+/// Which way the phase runs, and the lag in pixels that shows its error best; `None` if that is too long.
+fn lag(width: usize, height: usize, row: Row<'_>, steps: usize) -> Option<(bool, usize)> {
+    let pairs = (ROWS / 3).min(height / 2);
+    let rows: Vec<usize> = (0..pairs).map(|i| i * (height - 2) / pairs.saturating_sub(1).max(1)).collect();
+    let look = |&y: &usize| {
+        let (upper, lower) = (row(y), row(y + 1));
+        let across = upper.windows(2).filter_map(|w| Some(wrap(w.last()? - w.first()?).abs()));
+        let along = upper.iter().zip(&lower).map(|(a, b)| wrap(a - b).abs());
+        let [across, along]: [Vec<f32>; 2] = [across.collect(), along.collect()];
+        [across, along].map(|v| v.into_iter().filter(|s| !s.is_nan()).collect::<Vec<f32>>())
+    };
+    let found: Vec<[Vec<f32>; 2]> = threads::install(|| rows.par_iter().map(look).collect());
+    let (mut across, mut along) = (Vec::new(), Vec::new());
+    for [a, b] in found {
+        across.extend(a);
+        along.extend(b);
+    }
+    let (across, along) = (median(&mut across)?, median(&mut along)?);
+    let down = along > across;
+    let lag = LAG / (steps as f64 * f64::from(across.max(along)));
+    let reach = if down { height } else { width };
+    (lag <= LONGEST_LAG && (reach as f64) > 4.0 * lag + 4.0).then(|| (down, lag.round().max(1.0) as usize))
+}
+
+fn samples(width: usize, height: usize, row: Row<'_>, steps: usize, rows: usize) -> Option<Vec<Vec<Sample>>> {
+    let (down, lag) = lag(width, height, row, steps)?;
+    let (first, last) = if down { (lag, height.checked_sub(lag + 1)?) } else { (0, height - 1) };
+    let count = rows.min(last.checked_sub(first)? + 1);
+    let at: Vec<usize> = (0..count).map(|i| first + i * (last - first) / count.saturating_sub(1).max(1)).collect();
+    let look = |&y: &usize| -> Vec<Sample> {
+        let here = row(y);
+        let steps = steps as f32;
+        // Every other pixel: neighbours' differences share most of their noise.
+        if down {
+            let (above, below) = (row(y - lag), row(y + lag));
+            let three = above.iter().zip(&here).zip(&below).skip(y % 2).step_by(2);
+            three.filter_map(|((&a, &b), &c)| Sample::of([a, b, c], steps)).collect()
+        } else {
+            let ahead = here.get(2 * lag..).unwrap_or_default();
+            let three = here.iter().zip(here.get(lag..).unwrap_or_default()).zip(ahead).skip(y % 2).step_by(2);
+            three.filter_map(|((&a, &b), &c)| Sample::of([a, b, c], steps)).collect()
+        }
+    };
+    let found: Vec<Vec<Sample>> = threads::install(|| at.par_iter().map(look).collect());
+    (found.iter().map(Vec::len).sum::<usize>() >= FEWEST).then_some(found)
+}
+
+/// Normal equations of a row.
+struct Normal {
+    matrix: Square,
+    right: Terms,
+}
+
+fn residual(sample: &Sample, terms: &[f32; TERMS]) -> f32 {
+    sample.phase - sample.sines.iter().zip(terms).map(|(s, c)| s * c).sum::<f32>()
+}
+
+fn normal(samples: &[Sample], terms: &[f32; TERMS], scale: f32, of_residual: bool) -> Normal {
+    let (mut matrix, mut right) = ([[0.0f64; TERMS]; TERMS], [0.0f64; TERMS]);
+    for sample in samples {
+        let r = residual(sample, terms);
+        let u = r / scale;
+        let near = (1.0 - u * u).max(0.0);
+        let (w, y) = (f64::from(near * near), f64::from(if of_residual { r } else { sample.phase }));
+        let sines = sample.sines.map(f64::from);
+        for ((row, right), s) in matrix.iter_mut().zip(&mut right).zip(&sines) {
+            let ws = w * s;
+            *right += ws * y;
+            row.iter_mut().zip(&sines).for_each(|(m, t)| *m += ws * t);
+        }
+    }
+    Normal { matrix: Square::from_fn(|i, j| matrix[i][j]), right: Terms::from_column_slice(&right) }
+}
+
+/// The rows' sums of a shot, and the fit to them.
+struct Fit {
+    rows: Vec<Vec<Sample>>,
+    terms: [f32; TERMS],
+    scale: f32,
+}
+
+impl Fit {
+    fn sums(&self, of_residual: bool) -> Vec<Normal> {
+        let sum = |row: &Vec<Sample>| normal(row, &self.terms, self.scale, of_residual);
+        threads::install(|| self.rows.par_iter().map(sum).collect())
+    }
+
+    /// Reweights and solves again; `None` where the terms are not determined.
+    fn improve(&mut self) -> Option<()> {
+        let mut misses: Vec<f32> = self.rows.iter().flatten().map(|s| residual(s, &self.terms).abs()).collect();
+        self.scale = (TUKEY * MEDIAN_TO_SIGMA) as f32 * median(&mut misses)?.max(1e-6);
+        let (mut matrix, mut right) = (Square::zeros(), Terms::zeros());
+        for row in self.sums(false) {
+            matrix += row.matrix;
+            right += row.right;
+        }
+        let solved = matrix.cholesky()?.solve(&right);
+        self.terms = std::array::from_fn(|m| solved.get(m).copied().unwrap_or(0.0) as f32);
+        Some(())
+    }
+
+    /// What stands z standard deviations above zero.
+    fn judged(&self, steps: usize, z: f64) -> Option<PhaseError> {
+        let (mut matrix, mut scatter) = (Square::zeros(), Square::zeros());
+        for row in self.sums(true) {
+            matrix += row.matrix;
+            scatter += row.right * row.right.transpose();
+        }
+        let inverse = matrix.cholesky()?.inverse();
+        let variance = (inverse * scatter * inverse).diagonal();
+        // Turns of a phase in turns: as many radians in radians.
+        let mut found = PhaseError::none(steps);
+        found.sin_rad = self.terms.map(|c| TAU * f64::from(c));
+        found.standard_rad = std::array::from_fn(|m| TAU * variance.get(m).map_or(0.0, |v| v.max(0.0).sqrt()));
+        let clear = |(c, s): (&f64, &f64)| c.abs() > z * s;
+        let last = found.sin_rad.iter().zip(&found.standard_rad).rposition(clear).map_or(0, |m| m + 1);
+        found.sin_rad.iter_mut().skip(last).for_each(|c| *c = 0.0);
+        let large = |(c, s): (&f64, &f64)| c.abs() > (z * s).max(display_rounding_rad(steps));
+        if found.sin_rad.iter().zip(&found.standard_rad).any(large) && found.is_one_to_one() {
+            found.source = ErrorSource::Phase;
+        } else {
+            found.sin_rad = [0.0; TERMS];
+        }
+        Some(found)
+    }
+}
+
+fn seen_in_rows(width: usize, height: usize, row: Row<'_>, steps: usize, z: f64, rows: usize) -> Option<PhaseError> {
+    if height < 2 || width < 2 {
+        return None;
+    }
+    let mut fit = Fit { rows: samples(width, height, row, steps, rows)?, terms: [0.0; TERMS], scale: 0.0 };
+    fit.improve()?;
+    fit.improve()?;
+    let first = fit.judged(steps, z)?;
+    if !first.is_some() {
+        return Some(first);
+    }
+    for _ in 2..ITERATIONS {
+        fit.improve()?;
+    }
+    fit.judged(steps, z)
+}
+
+/// The error that harmonics of the light make: `ratios[p - 2]` is the amplitude of harmonic p over the fundamental's.
+///
+/// # Errors
+/// [`Error::OutOfRange`] for fewer than three steps, [`Error::NonFinite`], and [`Error::Degenerate`] where the
+/// harmonics outweigh the fundamental.
+pub fn error_of_harmonics(ratios: &[f64], steps: usize) -> Result<PhaseError> {
+    if let Some(index) = ratios.iter().position(|r| !r.is_finite()) {
+        return Err(Error::NonFinite { what: "harmonics", index });
+    }
+    if steps < 3 {
+        return Err(Error::OutOfRange { what: "steps", expected: "3 or more".into(), value: steps.to_string() });
+    }
+    // What is taken for the fundamental, over it: 1 + Σ r_{mN+1} e^{imθ} + r_{mN-1} e^{-imθ}, θ = Nφ.
+    let aliases: Vec<(f64, f64)> = (2..)
+        .zip(ratios)
+        .filter_map(|(p, &r)| match p % steps {
+            1 => Some((((p - 1) / steps) as f64, r)),
+            rest if rest == steps - 1 => Some((-(p.div_ceil(steps) as f64), r)),
+            _ => None,
+        })
+        .collect();
+    const POINTS: usize = 512;
+    let mut sums = [0.0; TERMS];
+    for i in 0..POINTS {
+        let theta = TAU * i as f64 / POINTS as f64;
+        // The phasor and its derivative by θ.
+        let (mut re, mut im, mut re1, mut im1) = (1.0, 0.0, 0.0, 0.0);
+        for &(m, r) in &aliases {
+            let (sin, cos) = (m * theta).sin_cos();
+            re += r * cos;
+            im += r * sin;
+            re1 -= m * r * sin;
+            im1 += m * r * cos;
+        }
+        if re <= 0.0 {
+            let reason = "they outweigh the fundamental".into();
+            return Err(Error::Degenerate { what: "harmonics", reason });
+        }
+        let error = im.atan2(re);
+        let slope = (im1 * re - re1 * im) / (re * re + im * im);
+        // c_m = 1/π ∫ Δ sin(mθ') dθ' = 1/(mπ) ∫ cos(mθ') dΔ, over the measured θ' = θ + NΔ.
+        let measured = theta + steps as f64 * error;
+        for (m, sum) in (1..).zip(&mut sums) {
+            *sum += 2.0 / f64::from(m) * (f64::from(m) * measured).cos() * slope / POINTS as f64;
+        }
+    }
+    PhaseError::given(steps, &sums)
+}
+
+/// The harmonics of light = level^gamma, over the fundamental, from the second on.
+pub fn harmonics_of_gamma(gamma: f64) -> Vec<f64> {
+    let mut ratio = 1.0;
+    let next = |p: usize| {
+        ratio *= (gamma - p as f64 + 1.0) / (gamma + p as f64);
+        ratio
+    };
+    (2..=HARMONICS).map(next).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// The phase that N steps of light = (0.5 + 0.5 cos)^gamma are measured as.
+    fn measured(phi: f64, gamma: f64, steps: usize) -> f64 {
+        let (mut re, mut im) = (0.0, 0.0);
+        for k in 0..steps {
+            let delta = TAU * k as f64 / steps as f64;
+            let light = (0.5 + 0.5 * (phi - delta).cos()).powf(gamma);
+            re += light * delta.cos();
+            im += light * delta.sin();
+        }
+        im.atan2(re)
+    }
+
+    fn rms_left(error: &PhaseError, gamma: f64) -> (f64, f64) {
+        let (mut before, mut after) = (0.0, 0.0);
+        for i in 0..1000 {
+            let phi = TAU * (f64::from(i) + 0.5) / 1000.0 - std::f64::consts::PI;
+            let found = measured(phi, gamma, error.steps);
+            let off = |x: f64| (x - phi + 3.0 * std::f64::consts::PI).rem_euclid(TAU) - std::f64::consts::PI;
+            let mut lane = [(found / TAU) as f32; TILE];
+            if let Some((steps, terms)) = error.in_turns() {
+                compensate(steps, &terms, &mut lane);
+            }
+            before += off(found).powi(2) / 1000.0;
+            after += off(f64::from(lane[0]) * TAU).powi(2) / 1000.0;
+        }
+        (before.sqrt(), after.sqrt())
+    }
+
+    #[test]
+    fn the_error_of_a_power_law_is_taken_off() {
+        for (gamma, steps, left) in [(1.35, 3, 1e-4), (2.2, 3, 2e-3), (0.6, 3, 2e-3), (1.35, 4, 5e-5), (2.2, 5, 2e-4)] {
+            let error = error_of_harmonics(&harmonics_of_gamma(gamma), steps).unwrap();
+            let (before, after) = rms_left(&error, gamma);
+            assert!(after < left && before > 10.0 * after, "gamma {gamma}, {steps} steps: {before} -> {after}");
+        }
+        assert!(error_of_harmonics(&harmonics_of_gamma(1.0), 3).unwrap().sin_rad.iter().all(|c| c.abs() < 1e-12));
+        assert!(error_of_harmonics(&[f64::NAN], 3).is_err());
+        assert!(error_of_harmonics(&[3.0], 3).is_err());
+        assert!(error_of_harmonics(&[0.1], 2).is_err());
+    }
+
+    /// A curved surface under fringes, with noise.
+    fn wall(gamma: f64, steps: usize, noise: f64, down: bool) -> Vec<f64> {
+        let mut state = 1u64;
+        let mut random = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
+        };
+        let at = |x: f64, y: f64| 0.3 * x + 1e-4 * x * x + 0.02 * y;
+        let pixel = |i: usize| {
+            let (x, y) = ((i % 400) as f64, (i / 400) as f64);
+            measured(if down { at(y, x) } else { at(x, y) }, gamma, steps)
+        };
+        (0..400 * 300).map(|i| pixel(i) + noise * 12f64.sqrt() * random()).collect()
+    }
+
+    #[test]
+    fn the_error_is_seen_in_the_phase_itself() {
+        for (gamma, steps, down) in [(1.35, 3, false), (1.35, 3, true), (2.2, 3, false), (0.7, 3, true), (1.5, 4, true)] {
+            let phase = wall(gamma, steps, 0.01, down);
+            let seen = seen_in_phase(&phase, 400, steps, 5.0, 24).unwrap().unwrap();
+            let known = error_of_harmonics(&harmonics_of_gamma(gamma), steps).unwrap();
+            assert_eq!(seen.source, ErrorSource::Phase);
+            for (m, (c, k)) in seen.sin_rad.iter().zip(&known.sin_rad).enumerate() {
+                assert!((c - k).abs() < 6.0 * seen.standard_rad[m] + 2e-3, "{seen:?} {known:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn nothing_is_seen_where_there_is_nothing() {
+        let seen = seen_in_phase(&wall(1.0, 3, 0.01, false), 400, 3, 5.0, 24).unwrap().unwrap();
+        assert_eq!(seen.source, ErrorSource::Nothing);
+        assert_eq!(seen.sin_rad, [0.0; TERMS]);
+        assert!(seen.standard_rad[0] > 0.0);
+        // A flat phase, noise alone, and nothing at all.
+        assert_eq!(seen_in_phase(&[0.3; 400 * 300], 400, 3, 5.0, 24).unwrap(), None);
+        assert_eq!(seen_in_phase(&[f64::NAN; 400 * 300], 400, 3, 5.0, 24).unwrap(), None);
+        let noise: Vec<f64> = wall(1.0, 3, 50.0, false);
+        assert!(seen_in_phase(&noise, 400, 3, 5.0, 24).unwrap().is_none_or(|e| !e.is_some()));
+        assert!(seen_in_phase(&[0.0; 10], 3, 3, 5.0, 24).is_err());
+        assert!(seen_in_phase(&[0.0; 9], 3, 2, 5.0, 24).is_err());
+        assert!(seen_in_phase(&[], 0, 3, 5.0, 24).is_err());
+    }
+
+    #[test]
+    fn one_to_one_or_refused() {
+        assert!(PhaseError::given(3, &[0.2, 0.02]).is_ok());
+        assert!(PhaseError::given(3, &[0.5]).is_err());
+        assert!(PhaseError::given(3, &[f64::NAN]).is_err());
+        assert!(PhaseError::given(2, &[0.1]).is_err());
+        assert!(PhaseError::given(3, &[0.0; TERMS + 1]).is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn sine_and_cosine_are_those_of_the_standard_library(x in -20.0..20.0f32) {
+            let (sin, cos) = sin_cos_turns(x);
+            let (s, c) = (f64::from(x) * TAU).sin_cos();
+            prop_assert!((f64::from(sin) - s).abs() < 1e-5 && (f64::from(cos) - c).abs() < 1e-5);
+        }
+    }
+}

@@ -113,6 +113,14 @@ def inspect(
             help="Judge although the scanner's verification failed or expired; the report states the reason.",
         ),
     ] = None,
+    response: Annotated[
+        str,
+        typer.Option(
+            help="The projector's response. auto: compensated as the fringes show it; off; or the file of "
+            "'weldscan calibrate response', for patterns that were projected without it.",
+            metavar="auto|off|FILE",
+        ),
+    ] = "auto",
 ) -> None:
     """Measure a recorded session and judge it: result.json, report.html, profile.csv, cloud.ply."""
     from weldscan.norms import load_norm
@@ -124,7 +132,7 @@ def inspect(
         load_norm(norm_id)
     out = out if out is not None else Path(f"{session.resolve().name}-report")
     whole_folder.check(out, is_result)
-    found = _inspect_into(session, out, method, norms, history, accept_verification)
+    found = _inspect_into(session, out, method, norms, response, history, accept_verification)
     _summary(found, out)
     raise typer.Exit(EXIT_CODES[found.verdict])
 
@@ -253,6 +261,7 @@ def _inspect_into(
     out: Path,
     method: Method,
     norms: tuple[str, ...],
+    response: str = "auto",
     history: Path | None = None,
     accept: str | None = None,
 ) -> Inspection:
@@ -262,7 +271,9 @@ def _inspect_into(
     with _progress() as progress:
         asked = {"history": history, "accept_verification": accept}
         given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
-        found: Inspection = measure(session, method=method.value, norms=norms, progress=progress, **given)
+        found: Inspection = measure(
+            session, method=method.value, norms=norms, response=response, progress=progress, **given
+        )
         progress(1, 1, "writing the report")
         write_report(found, out)
     return found

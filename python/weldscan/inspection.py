@@ -9,10 +9,10 @@ import math
 import os
 import platform
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
-from typing import Any
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,8 @@ from weldscan.errors import GeometryError, InputError
 from weldscan.manifest import left_out as left_out_of
 from weldscan.norms import judge, load_norm
 from weldscan.paper_method import paper_step
-from weldscan.points import PointReader, Progress
+from weldscan.points import Compensate, PointReader, Progress
+from weldscan.response import Response, read_response
 from weldscan.result import (
     BudgetLine,
     HandEye,
@@ -57,6 +58,7 @@ def inspect(
     norms: Sequence[str] = DEFAULT_NORMS,
     history: str | os.PathLike[str] | None = None,
     accept_verification: str | None = None,
+    response: str | os.PathLike[str] | Response = "auto",
     progress: Progress | None = None,
 ) -> Inspection:
     """The step of a weld with its uncertainty and verdicts, from a session folder.
@@ -68,6 +70,8 @@ def inspect(
         history: of the scanner's verifications; by default the one that the session names or has beside it. Where
             there is one, the last verification of this scanner must have passed and be valid, else nothing is judged.
         accept_verification: the reason for which the scanner is relied on whatever its history says.
+        response: of the projector. `auto`: what the fringes themselves show above the noise is taken off their phase; `off`:
+            nothing; or a response, or the file of one (`weldscan calibrate response`), for patterns that were not corrected.
         progress: called with (done, total, what) while it works.
 
     Returns:
@@ -86,7 +90,7 @@ def inspect(
         >>> abs(result.step.max_abs_mm - abs(truth["step_mm"]["max_abs"])) < result.step.expanded_uncertainty_mm
         True
     """
-    run = _Run(folder, method, norms, progress, history, accept_verification)
+    run = _Run(folder, method, norms, response, progress, history, accept_verification)
     # 1-4  the three-sphere plate in every artefact shot: where the scanner sits on the flange
     hand_eye = hand_eye_of(run.read, run.left_out)
     # 5-6  every part shot: its points, its place in base, reference wall, other wall and bead
@@ -122,6 +126,7 @@ class _Run:
         folder: str | os.PathLike[str],
         method: str,
         norms: Sequence[str],
+        response: str | os.PathLike[str] | Response,
         progress: Progress | None,
         history: str | os.PathLike[str] | None,
         accept_verification: str | None,
@@ -136,7 +141,8 @@ class _Run:
         self.part: PartSpec = self.session.part
         self.method, self.norms = method, tuple(norms)
         self.standing = standing_of(self.session, history, accept_verification)
-        self.read = PointReader(self.session, progress)
+        self.response = response
+        self.read = PointReader(self.session, progress, _compensation(response))
         self.agreement: tuple[ShotAgreement, ...] = ()
         self.left_out: list[tuple[str, str]] = list(left_out_of(self.session.folder))
         unusable = {name for name, _ in self.left_out}
@@ -237,6 +243,9 @@ class _Run:
             for verdict in judge(norm, value, expanded, part, why_not_measured=reason, coverage_deg=coverage)
         ]
         scanner = self.scanner_record()
+        compensated = response_record(self.response, self.read.phase_errors)
+        if compensated["note"]:
+            self.read.warnings.append(compensated["note"])
         timing = self.read.timing
         timing["compute"] = sum(seconds for what, seconds in timing.items() if what != "read")
         return Inspection(
@@ -251,6 +260,7 @@ class _Run:
             left_out=tuple(self.left_out),
             warnings=tuple(self.read.warnings),
             masks=self.read.masks,
+            response=compensated,
             timing_s=timing,
             software={
                 "name": "weldscan",
@@ -308,6 +318,40 @@ class _Run:
             )
             expanded = math.hypot(expanded, 2 * placing)
         return expanded + abs(step.histogram.step_mm - float(np.abs(step.step_mm).mean()))
+
+
+def _compensation(response: str | os.PathLike[str] | Response) -> Compensate:
+    if response in ("auto", "off"):
+        return cast(Literal["auto", "off"], response)
+    table = response if isinstance(response, Response) else read_response(response)
+    return lambda fringe: table.phase_error(fringe.steps, fringe.periods)
+
+
+def response_record(
+    response: str | os.PathLike[str] | Response, errors: Mapping[str, list[dict[str, Any]]]
+) -> dict[str, Any]:
+    """What was done about the projector's response, for the result: how, how much, by which shots, and one line of it."""
+    taken = {name: [e for e in sets if e["from"] != "nothing"] for name, sets in errors.items()}
+    taken = {name: sets for name, sets in taken.items() if sets}
+    record: dict[str, Any] = {
+        "mode": response if response in ("auto", "off") else "table",
+        "table": None,
+        "compensated": sorted(taken),
+        "largest_rad": max((e["largest_rad"] for sets in taken.values() for e in sets), default=0.0),
+        "shots": dict(errors),
+        "note": None,
+    }
+    if isinstance(response, Response):
+        record["table"] = response.document()["id"]
+    elif record["mode"] == "table":
+        record["table"] = f"{os.fspath(response)} ({read_response(response).document()['id']})"
+    if taken:
+        by = "by the table given" if record["table"] else "as the fringes themselves show it"
+        record["note"] = (
+            f"the projector's light is not proportional to its level: the phase of {len(taken)} of {len(errors)} shots was "
+            f"compensated, {by}, by up to {record['largest_rad']:.4f} rad"
+        )
+    return record
 
 
 BUDGET = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,6 +13,10 @@ from weldscan.errors import InputError
 from weldscan.session import FringeSet, Session, ShotSpec, read_frames
 
 Progress = Callable[[int, int, str], None]
+
+PhaseErrorOf = Callable[[FringeSet], Sequence[float]]
+"""The known error of a set's phase: coefficients of sin(m steps phase), rad."""
+Compensate = Literal["auto", "off"] | PhaseErrorOf
 
 # A harmonic of a tenth of the fringes' own amplitude shifts a four-step phase by 0.01 rad or more: worth a word.
 HARMONIC_WARNING = 0.1
@@ -25,15 +30,17 @@ class PointReader:
         timing: seconds spent per step.
         masks: per shot, how many pixels were measured, and how many not for which reason.
         warnings: what a reader of the result should know.
+        phase_errors: per shot, what was taken off the phase of each fringe set for the projector's response.
     """
 
-    def __init__(self, session: Session, progress: Progress | None = None) -> None:
-        self.session, self.progress = session, progress
+    def __init__(self, session: Session, progress: Progress | None = None, compensate: Compensate = "auto") -> None:
+        self.session, self.progress, self.compensate = session, progress, compensate
         self.scanner: Scanner = session.scanner.build()
         self.axis, self.fringes, self.frames = fringe_axis(session.fringes, self.scanner)
         self.timing: dict[str, float] = {}
         self.masks: dict[str, dict[str, int]] = {}
         self.warnings: list[str] = []
+        self.phase_errors: dict[str, list[dict[str, Any]]] = {}
 
     def __call__(self, shot: ShotSpec) -> Cloud:
         """The shot's points, scanner frame, on the camera's pixel grid."""
@@ -44,8 +51,13 @@ class PointReader:
         t = self.clock("read", t)
         projector = self.scanner.projector
         size = projector.width if self.axis == "x" else projector.height
+        wanted: Literal["auto"] | list[Sequence[float]] | None = None
+        if self.compensate == "auto":
+            wanted = "auto"
+        elif callable(self.compensate):
+            wanted = [self.compensate(f) for f in self.fringes]
         try:
-            phase = decode(exposures, [(f.periods, f.steps) for f in self.fringes], size)
+            phase = decode(exposures, [(f.periods, f.steps) for f in self.fringes], size, phase_error=wanted)
         except InputError as error:
             # The images were checked when they were read: what is left are the fringe sets.
             raise InputError(f"{self.session.folder / 'session.json'}: fringes: {error}") from None
@@ -64,11 +76,23 @@ class PointReader:
     def _note(self, shot: ShotSpec, phase: PhaseMap) -> None:
         self.masks[shot.name] = dict(zip(MASKS, map(int, phase.counts), strict=True))
         worst = max((h for h in phase.harmonics if h is not None), default=0.0)
-        if worst > HARMONIC_WARNING and phase.counts[0] > 0:
+        if worst > HARMONIC_WARNING and phase.counts[0] > 0 and self.compensate == "off":
             self.warnings.append(
-                f"{shot.name}: the fringes are not sinusoidal (harmonics {100 * worst:.0f} % of their amplitude): "
-                "the projector's response should be corrected"
+                f"{shot.name}: the fringes are not sinusoidal (harmonics {100 * worst:.0f} % of their amplitude) and "
+                "nothing was done about it: the projector's response should be corrected"
             )
+        self.phase_errors[shot.name] = [
+            {
+                "periods": fringe.periods,
+                "steps": fringe.steps,
+                "from": error.source,
+                "largest_rad": error.largest_rad,
+                "sin_rad": list(error.sin_rad),
+                "standard_rad": list(error.standard_rad),
+                "harmonics": harmonics,
+            }
+            for fringe, error, harmonics in zip(self.fringes, phase.phase_error, phase.harmonics, strict=True)
+        ]
 
     def why_dark(self, shot: ShotSpec) -> str | None:
         """Why hardly a pixel of a shot was measured, where that is so: a better reason than geometry has."""

@@ -40,7 +40,7 @@ class FringeResponse(BaseModel):
     harmonics: Coefficients = ()
     """Amplitude of the second, third ... harmonic of the light over the fundamental's, with its sign; empty where nothing
     was seen."""
-    sin_rad: Coefficients = Field(default=(), max_length=6)
+    sin_rad: Coefficients = Field(default=(), max_length=16)
     """Where the phase showed it: the error of a measured phase p is the sum of `sin_rad[m - 1] sin(m steps p)`."""
     standard_rad: Coefficients = ()
     """Standard deviations of these coefficients, also where none stands above the noise."""

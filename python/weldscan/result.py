@@ -260,6 +260,9 @@ class Inspection:
     """Part shots that saw a wall together, held against each other."""
     scanner: ScannerRecord | None = None
     """Which calibration of the scanner was used; None where the session does not say."""
+    response: dict[str, Any] = field(default_factory=dict)
+    """What was done about the projector's response: `mode` (auto, off, table), `compensated` shots, `largest_rad`, and per
+    shot and fringe set the series that was taken off the phase."""
 
     @property
     def judged_mm(self) -> float | None:

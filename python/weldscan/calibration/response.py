@@ -28,7 +28,7 @@ from weldscan.session import read_frames, read_session
 
 Floats = NDArray[np.float64]
 Image = NDArray[Any]
-ROWS = 400
+ROWS = 120
 """Rows of an image that are looked at where there is time."""
 Z = 5.0
 CLEAR = 10.0

@@ -121,6 +121,7 @@ def result_document(inspection: Inspection, created: datetime) -> dict[str, Any]
         "left_out": [{"shot": shot, "reason": reason} for shot, reason in inspection.left_out],
         "warnings": list(inspection.warnings),
         "masks": inspection.masks,
+        "response": inspection.response,
         "timing_s": inspection.timing_s,
         "software": {"version": __version__, **inspection.software},
     }
@@ -304,6 +305,8 @@ def _page(inspection: Inspection, created: datetime, view: Future[str | None], u
         matrix=_matrix(hand_eye),
         mask_names=MASKS,
         masks=_masks(inspection.masks),
+        response_names=_response_names(inspection.response),
+        response_rows=_response_rows(inspection.response),
         record=_record(inspection),
         mm=lambda value: "–" if value is None or not math.isfinite(value) else f"{value:.3f}".replace("-", "−"),
         signed=lambda value: f"{value:+.3f}".replace("-", "−"),
@@ -397,6 +400,30 @@ def _standing(inspection: Inspection) -> str:
     return standing.statement + held
 
 
+def _response_names(response: Mapping[str, Any]) -> list[str]:
+    first: list[dict[str, Any]] = next(iter(response.get("shots", {}).values()), [])
+    return [f"{e['periods']:g} fringes, {e['steps']} steps" for e in first]
+
+
+def _response_rows(response: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
+    """Per shot what was taken off the phase of each set; none where nothing was."""
+    if not response.get("compensated"):
+        return []
+
+    def cell(error: Mapping[str, Any]) -> str:
+        return "–" if error["from"] == "nothing" else f"{error['largest_rad']:.4f} ({error['from']})"
+
+    return [(shot, [cell(error) for error in errors]) for shot, errors in response["shots"].items()]
+
+
+def _response_line(response: Mapping[str, Any]) -> str:
+    if not response:
+        return "–"
+    if response["mode"] == "off":
+        return "not looked at, not compensated (off)"
+    return str(response["note"] or "no error of the phase above the noise; nothing was compensated")
+
+
 def _record(inspection: Inspection) -> list[tuple[str, str]]:
     part = [(f"part: {name}", str(value)) for name, value in inspection.part.items() if value is not None]
     timing = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in inspection.timing_s.items())
@@ -405,6 +432,7 @@ def _record(inspection: Inspection) -> list[tuple[str, str]]:
         ("frame of the cloud", inspection.frame),
         ("verification of the scanner", _standing(inspection)),
         *part,
+        ("projector's response", _response_line(inspection.response)),
         ("time", timing),
         *((name.replace("_", " "), value) for name, value in inspection.software.items()),
     ]

@@ -6,7 +6,7 @@ use std::f64::consts::TAU;
 
 use multiversion::multiversion;
 
-use super::response::{self, PhaseError, TERMS};
+use super::response::{self, PhaseError};
 use super::wave::{Lane, Level, Sinusoid, TILE, Wave, round, turns};
 use super::{FringeSet, Noise, Reason, Shot};
 use crate::unwrap::Plan;
@@ -293,7 +293,7 @@ pub(super) struct Decoder<'a, T> {
     /// First frame, number of steps, wave and limits of each set.
     sets: Vec<(usize, usize, Wave, Judge)>,
     /// What is taken off each set's phase: steps and series.
-    errors: Vec<Option<(f32, [f32; TERMS])>>,
+    errors: Vec<Option<(f32, Vec<f32>)>>,
     chain: Chain,
 }
 

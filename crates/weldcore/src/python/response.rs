@@ -76,7 +76,7 @@ pub(super) fn compensation(
 
 /// The error of a wrapped phase by the projector's response, seen in the phase itself.
 ///
-/// Minimises, robustly (Tukey), the second differences of `p - sum of c_m sin(m N p)` over 0.4 of the error's wave: the
+/// Minimises, robustly (Tukey), the second differences of the phase without the error, over parts of the error's wave: the
 /// surface is smooth over a few pixels, the error is not. Whole fringes drop out, so nothing needs to be unwrapped.
 ///
 /// Args:
@@ -135,7 +135,7 @@ fn estimate_phase_error(
 /// Example:
 ///     >>> from weldscan import harmonics_of_gamma, phase_error_of_harmonics
 ///     >>> round(phase_error_of_harmonics(harmonics_of_gamma(1.35), 3).largest_rad, 3)
-///     0.121
+///     0.1
 #[pyfunction]
 fn phase_error_of_harmonics(py: Python<'_>, harmonics: Vec<f64>, steps: usize) -> PyResult<PyPhaseError> {
     Ok((&error_of_harmonics(&harmonics, steps).map_err(|e| raise(py, &e))?).into())

@@ -72,6 +72,7 @@ from weldscan.pose import (
 
 if TYPE_CHECKING:
     from weldscan.calibration.hand_eye import solve_hand_eye
+    from weldscan.calibration.response import compensate_phase, estimate_response, response_of_folder
     from weldscan.calibration.scanner import BoardView, calibrate_scanner, solve_scanner
     from weldscan.inspection import inspect
     from weldscan.norms import judge, limit_mm, norm_ids
@@ -79,6 +80,7 @@ if TYPE_CHECKING:
     from weldscan.report import write_report
     from weldscan.report.validation import write_validation
     from weldscan.report.verification import write_verification
+    from weldscan.response import FringeResponse, Response, read_response, response_of_ramp, write_response
     from weldscan.result import Inspection, Label, ScannerCalibration, Standing, Validation, Verdict, Verification
     from weldscan.session import (
         Session,
@@ -96,6 +98,7 @@ if TYPE_CHECKING:
 # The faces are imported when they are asked for: they bring pydantic and OpenCV, which an algorithm does not need.
 _LAZY = {
     "weldscan.calibration.hand_eye": ("solve_hand_eye",),
+    "weldscan.calibration.response": ("compensate_phase", "estimate_response", "response_of_folder"),
     "weldscan.calibration.scanner": ("BoardView", "calibrate_scanner", "solve_scanner"),
     "weldscan.inspection": ("inspect",),
     "weldscan.paper_method": ("paper_step",),
@@ -103,6 +106,7 @@ _LAZY = {
     "weldscan.report": ("write_report",),
     "weldscan.report.validation": ("write_validation",),
     "weldscan.report.verification": ("write_verification",),
+    "weldscan.response": ("FringeResponse", "Response", "read_response", "response_of_ramp", "write_response"),
     "weldscan.result": (
         "Inspection",
         "Label",
@@ -144,6 +148,7 @@ __all__ = [
     "DeviceTimeout",
     "Follower",
     "FoundSphere",
+    "FringeResponse",
     "GeometryError",
     "InputError",
     "Inspection",
@@ -159,6 +164,7 @@ __all__ = [
     "PlaneFit",
     "ReferencePlane",
     "Registration",
+    "Response",
     "RigidFit",
     "Scanner",
     "ScannerCalibration",
@@ -179,6 +185,7 @@ __all__ = [
     "append_history",
     "calibrate_reference_plane",
     "calibrate_scanner",
+    "compensate_phase",
     "decode",
     "decode_gray",
     "decode_phase",
@@ -186,6 +193,7 @@ __all__ = [
     "distance",
     "estimate_normals",
     "estimate_phase_error",
+    "estimate_response",
     "find_spheres",
     "fit_cylinder",
     "fit_plane",
@@ -214,10 +222,13 @@ __all__ = [
     "read_frames",
     "read_history",
     "read_limits",
+    "read_response",
     "read_scanner",
     "read_session",
     "register_icp",
     "register_rigid",
+    "response_of_folder",
+    "response_of_ramp",
     "segment_weld",
     "set_threads",
     "simulate_shot",
@@ -232,6 +243,7 @@ __all__ = [
     "validate",
     "verify",
     "write_report",
+    "write_response",
     "write_scanner",
     "write_session",
     "write_validation",

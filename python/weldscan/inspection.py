@@ -70,8 +70,9 @@ def inspect(
         history: of the scanner's verifications; by default the one that the session names or has beside it. Where
             there is one, the last verification of this scanner must have passed and be valid, else nothing is judged.
         accept_verification: the reason for which the scanner is relied on whatever its history says.
-        response: of the projector. `auto`: what the fringes themselves show above the noise is taken off their phase; `off`:
-            nothing; or a response, or the file of one (`weldscan calibrate response`), for patterns that were not corrected.
+        response: of the projector. `auto`: what the fringes themselves show above the noise is taken off their phase;
+            `off`: nothing; or a response, or the file of one (`weldscan calibrate response`), for patterns that were
+            not corrected.
         progress: called with (done, total, what) while it works.
 
     Returns:
@@ -330,7 +331,7 @@ def _compensation(response: str | os.PathLike[str] | Response) -> Compensate:
 def response_record(
     response: str | os.PathLike[str] | Response, errors: Mapping[str, list[dict[str, Any]]]
 ) -> dict[str, Any]:
-    """What was done about the projector's response, for the result: how, how much, by which shots, and one line of it."""
+    """What was done about the projector's response, for the result: how, how much, in which shots; and a line."""
     taken = {name: [e for e in sets if e["from"] != "nothing"] for name, sets in errors.items()}
     taken = {name: sets for name, sets in taken.items() if sets}
     record: dict[str, Any] = {
@@ -348,8 +349,8 @@ def response_record(
     if taken:
         by = "by the table given" if record["table"] else "as the fringes themselves show it"
         record["note"] = (
-            f"the projector's light is not proportional to its level: the phase of {len(taken)} of {len(errors)} shots was "
-            f"compensated, {by}, by up to {record['largest_rad']:.4f} rad"
+            f"the projector's light is not proportional to its level: the phase of {len(taken)} of {len(errors)} shots "
+            f"was compensated, {by}, by up to {record['largest_rad']:.4f} rad"
         )
     return record
 

@@ -1,7 +1,7 @@
 """`weldscan-response/1`: the light of a projector over its level, as a camera saw it.
 
 Written by `weldscan devices check` and `weldscan calibrate response`, read by whoever corrects for it: a projector
-before the light (`response` in its section), an inspection afterwards (`--response`). This is the one home of the format.
+before the light (`response` in its section), an inspection afterwards (`--response`). The one home of the format.
 """
 
 from __future__ import annotations
@@ -19,10 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from weldscan._weldcore import harmonics_of_gamma, phase_error_of_harmonics
+from weldscan._weldcore import phase_error_of_harmonics
 from weldscan.errors import GeometryError, InputError
 from weldscan.session import explain, read_text
-
 
 Steps = Annotated[int, Field(ge=3)]
 Coefficients = tuple[float, ...]
@@ -38,8 +37,8 @@ class FringeResponse(BaseModel):
     steps: Steps
     """Of the images that it was seen in."""
     harmonics: Coefficients = ()
-    """Amplitude of the second, third ... harmonic of the light over the fundamental's, with its sign; empty where nothing
-    was seen."""
+    """Amplitude of the second, third ... harmonic of the light over the fundamental's, with its sign; empty where
+    nothing was seen."""
     sin_rad: Coefficients = Field(default=(), max_length=16)
     """Where the phase showed it: the error of a measured phase p is the sum of `sin_rad[m - 1] sin(m steps p)`."""
     standard_rad: Coefficients = ()
@@ -210,7 +209,7 @@ def response_of_ramp(level: ArrayLike, light: ArrayLike, *, noise: float = 0.0) 
 
 
 def write_response(path: str | os.PathLike[str], response: Response) -> None:
-    """Write a `weldscan-response/1` file; an earlier one is replaced. Raises `InputError` where it cannot be written."""
+    """Write a `weldscan-response/1` file; an earlier one is replaced. Raises `InputError` where it cannot be."""
     path = Path(path)
     fresh = path.with_name(f".{path.name}.new")
     try:

@@ -261,8 +261,8 @@ class Inspection:
     scanner: ScannerRecord | None = None
     """Which calibration of the scanner was used; None where the session does not say."""
     response: dict[str, Any] = field(default_factory=dict)
-    """What was done about the projector's response: `mode` (auto, off, table), `compensated` shots, `largest_rad`, and per
-    shot and fringe set the series that was taken off the phase."""
+    """What was done about the projector's response: `mode` (auto, off, table), `compensated` shots, `largest_rad`, and
+    per shot and fringe set the series that was taken off the phase."""
 
     @property
     def judged_mm(self) -> float | None:

@@ -302,3 +302,63 @@ def _say(found: ScannerCalibration, out: Path, page: Path) -> None:
         )
     print(f"        page: {page}")
     print(f'        kept in {out}; a session carries it as "scanner": "{out.name}"')
+
+
+@calibrate.command(
+    "response",
+    epilog="Example: weldscan calibrate response fringes --fringes 1x12,8x12,64x12 --out response.json",
+)
+def response(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER|SESSION",
+            help="A session; a folder of fringe images (with --fringes), numbered in the order of the sets and then of "
+            "the steps; or a ramp: even images whose names end in the level that they show.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="The file to write; an earlier response is replaced.")] = Path(
+        "response.json"
+    ),
+    fringes: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PxN,PxN...", help="Of the images in FOLDER: periods over the projector x steps, per set."
+        ),
+    ] = None,
+    shot: Annotated[str | None, typer.Option(help="Of the session. Default: the best of the first three.")] = None,
+) -> None:
+    """Find how the projector's light follows its level (gamma), and keep it as a table.
+
+    'project' and 'scan' show patterns corrected by it ([projector] response = "response.json" in the cell's
+    configuration); 'inspect --response response.json' compensates fringes that were recorded without it. By itself,
+    'inspect' compensates what the fringes show. Four or more steps, better eight or twelve, show the harmonics of the
+    light; three show only what they do to the phase.
+    """
+    from weldscan.calibration.response import parse_fringes, response_of_folder
+    from weldscan.report.response import response_svg
+    from weldscan.response import write_response
+
+    sets = None if fringes is None else parse_fringes(fringes)
+    with _progress() as progress:
+        progress(0, 1, f"reading {folder}")
+        found = response_of_folder(folder, sets, shot=shot)
+    write_response(out, found)
+    picture = out.with_suffix(".svg")
+    picture.write_text(response_svg(found), encoding="utf-8")
+    seen = {"ramp": "even images", "harmonics": "the fringes' harmonics", "phase": "the error of the fringes' phase"}
+    print(f"response {found.document()['id']} from {seen[found.method]}: like a gamma of {found.gamma:.3f}")
+    for entry in found.fringes:
+        if entry.harmonics:
+            worst = max(abs(c) for c in found.phase_error(3, entry.periods))
+            print(
+                f"         {entry.periods:g} fringes, {entry.steps} steps: second harmonic "
+                f"{100 * entry.harmonics[0]:+.1f} % "
+                f"of the fundamental; three steps would be off by {worst:.3f} rad"
+            )
+        else:
+            limit = f", known to {entry.standard_rad[0]:.4f} rad" if entry.standard_rad else ""
+            print(f"         {entry.periods:g} fringes, {entry.steps} steps: no error above the noise{limit}")
+    if not found.fringes:
+        print(f"         three steps would be off by {max(abs(c) for c in found.phase_error(3)):.3f} rad")
+    print(f'         kept in {out}, drawn in {picture}; [projector] response = "{out.name}" corrects patterns for it')

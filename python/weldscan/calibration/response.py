@@ -1,5 +1,5 @@
-"""`weldscan calibrate response`: how the projector's light follows its level, from a ramp or from fringe images; and what
-that does to phases that were recorded without a correction.
+"""`weldscan calibrate response`: how the projector's light follows its level, from a ramp or from fringe images; and
+what that does to phases that were recorded without a correction.
 """
 
 from __future__ import annotations
@@ -126,7 +126,9 @@ def _seen(
     return FringeResponse(periods=periods, steps=steps, harmonics=harmonics, sin_rad=sines, standard_rad=standard)
 
 
-def _harmonics_in(stack: Image, phase: Floats, modulation: NDArray[np.float32], clear: NDArray[np.bool_]) -> list[float]:
+def _harmonics_in(
+    stack: Image, phase: Floats, modulation: NDArray[np.float32], clear: NDArray[np.bool_]
+) -> list[float]:
     """Harmonics 2 to N/2 over the fundamental, with their sign: minimises the squared misfit over all clear pixels."""
     steps = len(stack)
     levels = stack[:, clear].astype(np.float64)
@@ -166,8 +168,9 @@ def _gamma_of_error(first_rad: float) -> float:
 def _light(harmonics: Sequence[float]) -> Floats:
     """Light over 256 levels: the harmonics of a full cosine are the Chebyshev coefficients of the response."""
     wave = np.arange(256) / 127.5 - 1
-    light: Floats = np.polynomial.chebyshev.chebval(wave, [0.0, 1.0, *harmonics])
-    return np.maximum.accumulate((light - light[0]) / (light[-1] - light[0]))
+    light = np.polynomial.chebyshev.chebval(wave, [0.0, 1.0, *harmonics])
+    rising: Floats = np.maximum.accumulate((light - light[0]) / (light[-1] - light[0])).astype(np.float64)
+    return rising
 
 
 def _series(phase: Floats, steps: int, sines: Sequence[float]) -> Floats:
@@ -192,13 +195,13 @@ def compensate_phase(
     Args:
         wrapped: (H, W) rad, or (sets, H, W); a `WrappedPhase` does.
         steps: N of the images that it came from, or of each set.
-        response: what is known: a `Response`, a `PhaseError`, or the coefficients of sin(m N phase), rad. None: what the
-            phase itself shows, see `estimate_phase_error`.
+        response: what is known: a `Response`, a `PhaseError`, or the coefficients of sin(m N phase), rad. None: what
+            the phase itself shows, see `estimate_phase_error`.
         periods: of the fringes over the projector, where a `Response` knows several frequencies.
         mask: (H, W), True where a pixel counts; others come back as NaN.
-        smooth: a 3x3 binomial filter afterwards, which leaves slopes alone: each pixel is averaged with pairs of opposite
-            neighbours, and only with those on one surface with it (second difference within five robust standard
-            deviations). White noise falls to 3/8. False: compensated, not filtered.
+        smooth: a 3x3 binomial filter afterwards, which leaves slopes alone: each pixel is averaged with pairs of
+            opposite neighbours, and only with those on one surface with it (second difference within five robust
+            standard deviations). White noise falls to 3/8. False: compensated, not filtered.
 
     Returns:
         as `wrapped`, float64, in (-pi, pi].
@@ -221,9 +224,7 @@ def compensate_phase(
         if not len(many) == len(freq) == len(phases):
             raise InputError(f"wrapped: {len(phases)} sets, {len(many)} steps, {len(freq)} periods")
         each = zip(phases, many, freq, strict=True)
-        return np.stack(
-            [compensate_phase(p, n, response, periods=f, mask=mask, smooth=smooth) for p, n, f in each]
-        )
+        return np.stack([compensate_phase(p, n, response, periods=f, mask=mask, smooth=smooth) for p, n, f in each])
     if phases.ndim != 2 or not isinstance(steps, int) or isinstance(periods, Sequence):
         raise InputError(f"wrapped: (H, W) with one number of steps, or (sets, H, W), got {phases.shape}")
     if steps < 3:
@@ -268,6 +269,25 @@ def _binomial(phase: Floats) -> Floats:
     return out
 
 
+def parse_fringes(text: str) -> list[tuple[float, int]]:
+    """Return (periods, steps) per set.
+
+    >>> parse_fringes("1x4, 8x4, 64x4")
+    [(1.0, 4), (8.0, 4), (64.0, 4)]
+    """
+    sets = []
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*([0-9.]+)\s*[x:]\s*(\d+)\s*", part)
+        try:
+            periods, steps = (float(match[1]), int(match[2])) if match else (0.0, 0)
+        except ValueError:
+            periods, steps = 0.0, 0
+        if periods <= 0 or steps < 3:
+            raise InputError(f"--fringes: {part.strip()!r} is not PERIODSxSTEPS with 3 steps or more, such as 64x4")
+        sets.append((periods, steps))
+    return sets
+
+
 # --- from files -------------------------------------------------------------------------------------------------------
 
 
@@ -277,8 +297,8 @@ def response_of_folder(
     """The response from a session, from a folder of fringe images, or from a folder with a ramp.
 
     Args:
-        folder: a `weldscan-session/1` folder; else, with `fringes`, images that are numbered in the order of the sets and
-            then of the steps; else even images whose names end in the level that they show (`ramp_128.png`).
+        folder: a `weldscan-session/1` folder; else, with `fringes`, images that are numbered in the order of the sets
+            and then of the steps; else even images whose names end in the level that they show (`ramp_128.png`).
         fringes: (periods, steps) of each set.
         shot: of the session; by default the one with the most clear pixels in its first image of fringes.
 
@@ -308,7 +328,9 @@ def _of_session(folder: Path, name: str | None) -> Response:
     if name is not None and name not in shots:
         raise InputError(f"shot: {name!r} is none of {', '.join(shots)}")
     axis = session.fringes[0].axis
-    keep, fringes, at = [], [], 0
+    keep: list[int] = []
+    fringes: list[tuple[float, int]] = []
+    at = 0
     for fringe in session.fringes:
         if fringe.axis == axis:
             keep.extend(range(at, at + fringe.steps))
@@ -338,7 +360,9 @@ def _of_ramp(files: Sequence[Path]) -> Response:
     for file in files:
         number = re.search(r"(\d+)$", file.stem)
         if number is None or int(number[1]) > 255:
-            raise InputError(f"{file}: its name should end in the level that it shows, 0 to 255; fringes need --fringes")
+            raise InputError(
+                f"{file}: its name should end in the level that it shows, 0 to 255; fringes need --fringes"
+            )
         levels.append(int(number[1]))
     images = [_read(file) for file in files]
     if len({image.shape for image in images}) > 1 or len({image.dtype for image in images}) > 1:

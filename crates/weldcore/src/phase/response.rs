@@ -35,12 +35,14 @@ const ROWS: usize = 24;
 const LAGS: [f64; 3] = [0.3, 0.6, 0.85];
 /// Pixels over which a surface counts as smooth. A set whose error has longer waves does not show it.
 const LONGEST_WAVE: f64 = 40.0;
+/// Of the pixels of a row, one in so many is looked at.
+const STRIDE: usize = 4;
 /// Fewer second differences say nothing.
 const FEWEST: usize = 1000;
 /// Reweighted solutions; Tukey's constant.
 const ITERATIONS: usize = 10;
-/// rad
-const CONVERGED: f64 = 1e-5;
+/// A tenth of what the coefficients are known to, rad.
+const CONVERGED: f64 = 2e-5;
 const TUKEY: f64 = 4.685;
 /// The median of |x| over the standard deviation of x.
 const MEDIAN_TO_SIGMA: f64 = 1.482_6;
@@ -334,8 +336,9 @@ fn samples(width: usize, height: usize, row: Row<'_>, steps: usize, rows: usize)
         } else {
             (&here[..], here.get(lag..).unwrap_or_default(), here.get(2 * lag..).unwrap_or_default())
         };
-        // Every other pixel: neighbours' differences share most of their noise.
-        let three = before.iter().zip(middle).zip(after).skip(y % 2).step_by(2).map(|((&a, &b), &c)| [a, b, c]);
+        // Some of the pixels: what neighbours say is much the same.
+        let three =
+            before.iter().zip(middle).zip(after).skip(y % STRIDE).step_by(STRIDE).map(|((&a, &b), &c)| [a, b, c]);
         three.filter(|t| t.iter().all(|p| p.is_finite())).collect()
     };
     let found: Vec<Vec<Three>> = lags.iter().cycle().take(count).enumerate().map(look).collect();

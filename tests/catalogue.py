@@ -28,6 +28,8 @@ INSTANT = {
     "Plane": "keeps numbers",
     "Scanner": "keeps numbers",
     "Sphere": "keeps numbers",
+    "harmonics_of_gamma": "47 products",
+    "phase_error_of_harmonics": "512 points of a curve",
     "set_threads": "sets a number",
     "sphere_through_points": "four points",
 }
@@ -310,6 +312,14 @@ def _(scale: float) -> Job:
 def _(scale: float) -> Job:
     images, _, _ = fringes_on_a_wall(scale)
     return lambda: ws.decode_phase(images, [4, 4, 4])
+
+
+@job("estimate_phase_error")
+def _(scale: float) -> Job:
+    y, x = np.mgrid[: round(300 * scale), :400]
+    phase = 0.3 * x + 1e-4 * x**2 + 0.01 * y
+    phase += 0.2 * np.sin(3 * phase) + random(1).normal(size=phase.shape) * 0.01
+    return lambda: np.array(ws.estimate_phase_error(phase, 3, rows=len(phase)).sin_rad)
 
 
 @job("unwrap_temporal")

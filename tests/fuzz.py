@@ -297,6 +297,11 @@ SANE: dict[str, Callable[[Random], Arguments]] = {
     "decode_png": png,
     "distance": lambda r: {"points": points(r), "target": target(r), "signed": bool(r.random() < 0.5)},
     "estimate_normals": lambda r: {"points": grid(r) if r.random() < 0.5 else points(r), "k": few(r, 25)},
+    "estimate_phase_error": lambda r: {
+        "phase_rad": 0.3 * np.arange(400) + 0.2 * np.sin(0.9 * np.arange(400)) + r.normal(size=(60, 400)) * 0.1,
+        "steps": 3 + few(r, 5),
+        "rows": few(r),
+    },
     "find_spheres": lambda r: {
         "points": grid(r) if r.random() < 0.5 else points(r),
         "radius_mm": 10.0 ** r.uniform(-2, 2),
@@ -304,8 +309,10 @@ SANE: dict[str, Callable[[Random], Arguments]] = {
     "fit_cylinder": fit_of_radius,
     "fit_plane": fit,
     "fit_sphere": fit_of_radius,
+    "harmonics_of_gamma": lambda r: {"gamma": r.uniform(0.1, 5)},
     "height_from_reference": height,
     "measure_step": lambda r: {"shots": [weld_shot()] * few(r, 3), "angle_sigma_rad": r.random() * 0.01},
+    "phase_error_of_harmonics": lambda r: {"harmonics": list(r.normal(size=few(r)) * 0.1), "steps": 3 + few(r, 5)},
     "place_shots": placing,
     "register_icp": registration,
     "register_rigid": lambda r: (

@@ -103,9 +103,7 @@ impl PhaseError {
     /// a series that no phase can have: two phases would be measured as one.
     pub fn given(steps: usize, sin_rad: &[f64]) -> Result<Self> {
         let wrong = |expected: String, value: String| Err(Error::OutOfRange { what: "phase_error", expected, value });
-        if steps < 3 {
-            return wrong("of 3 or more steps".into(), steps.to_string());
-        }
+        check_steps(steps)?;
         if sin_rad.len() > TERMS {
             return wrong(format!("at most {TERMS} coefficients"), sin_rad.len().to_string());
         }
@@ -214,12 +212,10 @@ pub(super) fn seen_in_shot<T: Level>(
 /// spread over the image. `None` where its waves are too long, or too little of them is in view, to see any.
 ///
 /// # Errors
-/// [`Error::Shape`] where the phase does not have that size, [`Error::OutOfRange`] for fewer than three steps or z ≤ 0.
+/// [`Error::Shape`] where the phase does not have that size, [`Error::OutOfRange`] for fewer than three steps or too many, or z ≤ 0.
 pub fn seen_in_phase(phase_rad: &[f64], width: usize, steps: usize, z: f64, rows: usize) -> Result<Option<PhaseError>> {
     require_positive("z", z)?;
-    if steps < 3 {
-        return Err(Error::OutOfRange { what: "steps", expected: "3 or more".into(), value: steps.to_string() });
-    }
+    check_steps(steps)?;
     if width == 0 || phase_rad.is_empty() || !phase_rad.len().is_multiple_of(width) {
         let got = format!("{} values, {width} in a row", phase_rad.len());
         return Err(Error::Shape { what: "phase_rad", expected: "an image (H, W)".into(), got });
@@ -262,6 +258,14 @@ fn shot_row<T: Level>(
         }
     }
     row
+}
+
+/// More steps than 10,000 no camera takes, and their sines are none in single precision.
+fn check_steps(steps: usize) -> Result<()> {
+    if (3..=10_000).contains(&steps) {
+        return Ok(());
+    }
+    Err(Error::OutOfRange { what: "steps", expected: "3 to 10000".into(), value: steps.to_string() })
 }
 
 fn wrap(x: f32) -> f32 {
@@ -499,9 +503,7 @@ pub fn error_of_harmonics(ratios: &[f64], steps: usize) -> Result<PhaseError> {
     if let Some(index) = ratios.iter().position(|r| !r.is_finite()) {
         return Err(Error::NonFinite { what: "harmonics", index });
     }
-    if steps < 3 {
-        return Err(Error::OutOfRange { what: "steps", expected: "3 or more".into(), value: steps.to_string() });
-    }
+    check_steps(steps)?;
     // What is taken for the fundamental, over it: 1 + Σ r_{mN+1} e^{imθ} + r_{mN-1} e^{-imθ}, θ = Nφ.
     let aliases: Vec<(f64, f64)> = (2..)
         .zip(ratios)

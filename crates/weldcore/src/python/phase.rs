@@ -212,8 +212,7 @@ fn decode(
     let fringes: Vec<(f64, Whole)> = parts("fringes", "a list of (periods, steps)", fringes)?;
     let sets: Vec<FringeSet> =
         fringes.into_iter().map(|(periods, steps)| FringeSet { periods, steps: steps.0 }).collect();
-    let options =
-        DecodeOptions { saturation, z, compensation: super::response::compensation(py, phase_error, &sets)? };
+    let options = DecodeOptions { saturation, z, compensation: super::response::compensation(py, phase_error, &sets)? };
     let wide = stacks.first().and_then(|f| f.first()).is_some_and(|f| f.cast::<PyArray2<u16>>().is_ok());
     if wide {
         decode_as::<u16>(py, &stacks, &sets, projector_size, &options)

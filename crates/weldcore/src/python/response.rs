@@ -3,7 +3,7 @@
 use numpy::PyUntypedArrayMethods;
 use pyo3::prelude::*;
 
-use super::{compute, float_matrix, raise};
+use super::{compute, float_matrix, parts, raise, whole};
 use crate::error::Error;
 use crate::phase::{
     Compensation, FringeSet, PhaseError, error_of_harmonics, harmonics_of_gamma as harmonics_of_gamma_core,
@@ -90,7 +90,7 @@ pub(super) fn compensation(
 ///     "nothing"; None where the fringes are too coarse (the error's wave is beyond 40 px) or too few pixels have a phase.
 ///
 /// Raises:
-///     InputError: not an image, fewer than three steps.
+///     InputError: not an image, fewer than three steps or more than 10,000.
 ///
 /// Source: the alias of harmonics in N-step phases, e.g. Pan et al., Optics Letters 34 (2009) 416; see docs/method.md.
 ///
@@ -106,9 +106,9 @@ pub(super) fn compensation(
 fn estimate_phase_error(
     py: Python<'_>,
     phase_rad: &Bound<'_, PyAny>,
-    steps: usize,
+    #[pyo3(from_py_with = whole)] steps: usize,
     z: f64,
-    rows: usize,
+    #[pyo3(from_py_with = whole)] rows: usize,
 ) -> PyResult<Option<PyPhaseError>> {
     let image = float_matrix("phase_rad", phase_rad)?;
     let width = image.shape()[1];
@@ -137,7 +137,12 @@ fn estimate_phase_error(
 ///     >>> round(phase_error_of_harmonics(harmonics_of_gamma(1.35), 3).largest_rad, 3)
 ///     0.1
 #[pyfunction]
-fn phase_error_of_harmonics(py: Python<'_>, harmonics: Vec<f64>, steps: usize) -> PyResult<PyPhaseError> {
+fn phase_error_of_harmonics(
+    py: Python<'_>,
+    harmonics: &Bound<'_, PyAny>,
+    #[pyo3(from_py_with = whole)] steps: usize,
+) -> PyResult<PyPhaseError> {
+    let harmonics: Vec<f64> = parts("harmonics", "a list of ratios", harmonics)?;
     Ok((&error_of_harmonics(&harmonics, steps).map_err(|e| raise(py, &e))?).into())
 }
 

@@ -637,6 +637,11 @@ def _warnings(
     if found.jackknife_mm is not None and found.jackknife_mm > 3 * found.shape_u_mm and len(found.poses) > 3:
         out.append(
             f"the poses agree with each other to {found.jackknife_mm:.3f} mm only, their noise explains "
-            f"{found.shape_u_mm:.3f} mm: is the board flat, and printed as stated?"
+            f"{found.shape_u_mm:.3f} mm: "
+            + (
+                "is the board flat, and printed as stated?"
+                if found.board_sigma_mm is None
+                else "too few tilts, heat, or a projector whose response bends the phase?"
+            )
         )
     return out

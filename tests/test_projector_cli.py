@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from weldscan import InputError
+from weldscan import InputError, response_of_folder
 from weldscan.fringes import fringe_patterns
 from weldscan.response import measured, read_response
 from weldscan.station.cli import register
@@ -74,10 +74,12 @@ def test_devices_check_of_the_simulated_cell(tmp_path, run):
     config = tmp_path / "cell.toml"
     config.write_text('[camera]\nbackend = "simulated"\n[projector]\nbackend = "simulated"\n')
     out = tmp_path / "response.json"
-    printed = run("devices", "check", "--config", str(config), "--out", str(out)).stdout
+    ramp = tmp_path / "ramp"
+    printed = run("devices", "check", "--config", str(config), "--out", str(out), "--ramp", str(ramp)).stdout
     assert "2 refreshes" in printed
     response = read_response(out).table()
     assert np.abs(response - np.arange(256) / 255).max() < 0.02  # this cell's light is linear
+    assert np.abs(response_of_folder(ramp).table() - response).max() < 0.01
 
 
 def test_devices_check_measures_the_projector_itself(tmp_path, run):

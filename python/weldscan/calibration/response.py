@@ -367,7 +367,9 @@ def _of_ramp(files: Sequence[Path]) -> Response:
     images = [_read(file) for file in files]
     if len({image.shape for image in images}) > 1 or len({image.dtype for image in images}) > 1:
         raise InputError("ramp: images of different sizes or depths")
-    top = np.iinfo(images[0].dtype).max
+    # 16-bit files often hold fewer bits: the narrowest scale that holds what was seen.
+    brightest = max(int(image.max()) for image in images)
+    top = 255 if images[0].dtype == np.uint8 else next(2**b - 1 for b in (8, 10, 12, 14, 16) if brightest < 2**b)
     order = np.argsort(levels)
     black, white = (images[order[i]].astype(np.int64) for i in (0, -1))
     lit = (white < top) & (white - black > 0.05 * top)

@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +16,9 @@ from weldscan.devices.camera import Camera, Image
 from weldscan.devices.projector import Projector
 from weldscan.errors import DeviceError, DeviceTimeout
 from weldscan.fringes import flat_pattern
+from weldscan.manifest import write_durably
 from weldscan.response import Response, response_of_ramp
+from weldscan.session import PNG_PARAMETERS
 from weldscan.station.capture import full_scale, set_exposure
 
 LONGEST_LATENCY_S = 2.0
@@ -58,8 +62,13 @@ def latency_s(camera: Camera, projector: Projector, repeats: int = 5) -> tuple[f
     return tuple(found)
 
 
-def response(camera: Camera, projector: Projector, levels: int = 18, frames: int = 3) -> Response:
-    """Return the response: the light that the camera sees at levels from 0 to 255."""
+def response(
+    camera: Camera, projector: Projector, levels: int = 18, frames: int = 3, keep: Path | None = None
+) -> Response:
+    """Return the response: the light that the camera sees at levels from 0 to 255.
+
+    An image of each level is left in the folder `keep`, for `weldscan calibrate response`.
+    """
     black, white = _flats(camera, projector)
     top = full_scale(white)
     lit = (white < top) & (white.astype(np.int64) - black > LEAST_CONTRAST * top)
@@ -69,7 +78,10 @@ def response(camera: Camera, projector: Projector, levels: int = 18, frames: int
     light = []
     for level in shown:
         _show(projector, int(level))
-        light.append(float(np.mean([camera.capture().image[lit].mean() for _ in range(frames)])))
+        images = [camera.capture().image for _ in range(frames)]
+        light.append(float(np.mean([image[lit].mean() for image in images])))
+        if keep is not None:
+            write_durably(keep / f"ramp_{level:03d}.png", cv2.imencode(".png", images[0], PNG_PARAMETERS)[1].tobytes())
     return response_of_ramp(shown, light)
 
 

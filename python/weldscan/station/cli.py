@@ -216,6 +216,10 @@ def devices_check(
         Path | None,
         typer.Option(help="Where the response table goes. Default: response.json beside CONFIG."),
     ] = None,
+    ramp: Annotated[
+        Path | None,
+        typer.Option(help="A folder in which an image of each level is left, for 'weldscan calibrate response'."),
+    ] = None,
 ) -> None:
     """Measure latency, response, saturated and dark pixels of projector and camera.
 
@@ -234,7 +238,9 @@ def devices_check(
         print(f"latency    {max(seconds) * 1000:.1f} ms at most of {len(seconds)}: latency_s = {max(seconds):.3f}")
         shares = check.pixels(camera, projector)
         print(f"pixels     saturated {shares.saturated:.2%}, dark {shares.dark:.2%}")
-        table = check.response(camera, projector)
+        if ramp is not None:
+            ramp.mkdir(parents=True, exist_ok=True)
+        table = check.response(camera, projector, keep=ramp)
         replace_durably(out, to_bytes(table.document()))
         named = out.name if out.parent == config.parent else out.resolve()
         print(f'response   gamma {check.gamma(table):.3f}, in {out}; [projector] response = "{named}" corrects it')

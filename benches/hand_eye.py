@@ -167,8 +167,9 @@ def table(draws: int, levels: Sequence[Level] = LEVELS, counts: Sequence[int] = 
                 if not touched and (shots < 5 or level.name.startswith("bad")):
                     continue
                 rms, inside = errors_mm(shots, level, touched, draws)
-                best = min(value for value in rms.values() if math.isfinite(value))
-                cells = ["–" if math.isnan(v) else f"**{v:.3f}**" if v == best else f"{v:.3f}" for v in rms.values()]
+                shown = {name: f"{value:.3f}" for name, value in rms.items() if math.isfinite(value)}
+                best = min(shown.values())
+                cells = [f"**{v}**" if v == best else v for v in (shown.get(name, "–") for name in METHODS)]
                 limit = limit_mm(shots, level, touched)
                 name = "touched" if touched else "unknown"
                 rows.append(f"| {name} | {level.name} | {shots} | {limit:.3f} | {' | '.join(cells)} | {inside:.3f} |")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,18 @@ import pytest
 
 import weldscan as ws
 from catalogue import ball, bits, sphere_mesh, tube
+from weldscan.devices.simulated import Block, Body, Photometry
 
 TREE = ws.KdTree(ball(50))
 MESH = ws.Mesh(*sphere_mesh(6))
 SCANNER_LENS = ws.Lens(16, 12, np.diag([20.0, 20.0, 1.0]), np.zeros(4))
+
+
+def simulate(**block: Any) -> Any:
+    body = Body(replace(Block((30.0, 30.0, 5.0)), **block), np.eye(4))
+    scanner = ws.Scanner(SCANNER_LENS, SCANNER_LENS, np.eye(4) + np.eye(4, k=3))
+    return ws.simulate_shot(scanner, np.eye(4), [body], [], Photometry())
+
 
 # By name: the call on (n, 3) points, sane points, and the fewest points it takes (0: none are as good as any).
 Call = Callable[[Any], Any]
@@ -185,6 +194,9 @@ def test_flat_clouds_have_neighbours_distances_and_a_registration(kind):
         lambda: ws.segment_weld(np.zeros((9, 9, 3)), -315.0, 6.0),
         lambda: ws.Lens(-1, 480, np.eye(3), np.zeros(4)),
         lambda: ws.Lens(640, 2**70, np.eye(3), np.zeros(4)),
+        lambda: simulate(squares=(3, 3, 3)),
+        lambda: simulate(size_mm=(1.0, 2.0)),
+        lambda: simulate(size_mm="large"),
         lambda: ws.set_threads(-1),
         lambda: ws.set_threads(2**70),
         lambda: ws.Mesh(np.zeros((3, 3)), [[0, 1, 3]]),

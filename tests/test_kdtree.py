@@ -63,6 +63,22 @@ def test_a_million_points_as_scipy():
     assert np.array_equal(distance, np.sqrt((d[:, 0] ** 2 + d[:, 1] ** 2) + d[:, 2] ** 2))
 
 
+@pytest.mark.parametrize("name", ["lattice", "duplicates", "collinear", "far"])
+def test_a_million_points_as_brute_force(name):
+    n, rng = 1_000_000, np.random.default_rng(4)
+    points = {
+        "lattice": lambda: np.stack(np.meshgrid(*[np.arange(100.0)] * 3), -1).reshape(-1, 3),
+        "duplicates": lambda: rng.normal(size=(1000, 3))[rng.integers(0, 1000, n)],
+        "collinear": lambda: np.outer(np.arange(float(n)), [1, 2, 3]),
+        "far": lambda: rng.normal(size=(n, 3)) + 1e6,
+    }[name]()
+    queries = points[rng.integers(0, n, 12)] + [[0], [0.5], [0.25]] * 4
+    distance, index = KdTree(points).nearest(queries)
+    for query, d, i in zip(queries, distance, index, strict=True):
+        expected = brute_force(points, query[None])[0]
+        assert (d, i) == (expected.min(), expected.argmin())
+
+
 def test_a_follower_answers_as_a_search():
     rng = np.random.default_rng(7)
     points = rng.normal(size=(20_000, 3)) * [30, 30, 1]

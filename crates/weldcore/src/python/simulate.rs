@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
-use pyo3::exceptions::{PyAttributeError, PyOverflowError, PyTypeError};
+use pyo3::exceptions::{PyAttributeError, PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 
 use super::scanner::PyScanner;
@@ -116,7 +116,8 @@ fn body(object: &Bound<'_, PyAny>) -> PyResult<Body> {
 fn wrong_object(py: Python<'_>, what: &str, error: PyErr) -> PyErr {
     let wrong = error.is_instance_of::<PyAttributeError>(py)
         || error.is_instance_of::<PyTypeError>(py)
-        || error.is_instance_of::<PyOverflowError>(py);
+        || error.is_instance_of::<PyOverflowError>(py)
+        || error.is_instance_of::<PyValueError>(py);
     if wrong { raise_as(py, "InputError", format!("{what}: {}", error.value(py))) } else { error }
 }
 

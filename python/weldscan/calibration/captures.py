@@ -231,7 +231,7 @@ def decode_stack(
             at += fringe.steps
         sets = [(fringe.periods, fringe.steps) for fringe in fringes if fringe.axis == axis]
         try:
-            maps.append(decode([[row[i] for i in frames] for row in exposures], sets, side))
+            maps.append(decode([[row[i] for i in frames] for row in exposures], sets, side, phase_error="auto"))
         except InputError as error:
             raise InputError(f"{where}: fringes: axis {axis}: {error}") from None
     height, width = exposures[0][0].shape

@@ -21,7 +21,7 @@ def run(monkeypatch, capsys, tmp_path):
     """Runs a command with `weldscan.inspection.inspect` replaced; gives exit code, stdout, stderr without progress."""
 
     def run(*arguments: str, finds=None):
-        def inspect(session_folder, *, method, norms, progress):
+        def inspect(session_folder, *, method, norms, progress, response="auto"):
             progress(1, 2, "measuring")
             if isinstance(finds, BaseException):
                 raise finds

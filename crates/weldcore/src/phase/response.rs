@@ -35,10 +35,12 @@ const ROWS: usize = 24;
 const LAGS: [f64; 3] = [0.3, 0.6, 0.85];
 /// Pixels over which a surface counts as smooth. A set whose error has longer waves does not show it.
 const LONGEST_WAVE: f64 = 40.0;
-/// Of the pixels of a row, one in so many is looked at.
-const STRIDE: usize = 4;
+/// Of a row, so many pixels are looked at, more or less: what neighbours say is much the same.
+const PER_ROW: usize = 160;
 /// Fewer second differences say nothing.
-const FEWEST: usize = 1000;
+const FEWEST: usize = 500;
+/// Pairs of rows in which the slope of the phase is looked at.
+const PROBES: usize = 8;
 /// Reweighted solutions; Tukey's constant.
 const ITERATIONS: usize = 10;
 /// A tenth of what the coefficients are known to, rad.
@@ -311,7 +313,7 @@ type Row<'a> = &'a (dyn Fn(usize) -> Vec<f32> + Sync);
 
 /// Whether the phase runs down the image, and the wave of its error in pixels; `None` if that is too long.
 fn error_wave(width: usize, height: usize, row: Row<'_>, steps: usize) -> Option<(bool, f64)> {
-    let pairs = (ROWS / 3).min(height / 2);
+    let pairs = PROBES.min(height / 2);
     let (mut across, mut along) = (Vec::new(), Vec::new());
     for i in 0..pairs {
         let y = i * (height - 2) / pairs.saturating_sub(1).max(1);
@@ -332,7 +334,7 @@ fn samples(width: usize, height: usize, row: Row<'_>, steps: usize, rows: usize)
     let margin = if down { lags.iter().copied().max()? } else { 0 };
     let reach = height.checked_sub(2 * margin + 1)?;
     let count = rows.min(reach + 1);
-    let look = |(i, &lag): (usize, &usize)| -> Vec<Three> {
+    let look = |(i, &lag): (usize, &usize), stride: usize| -> Vec<Three> {
         let y = margin + i * reach / count.saturating_sub(1).max(1);
         let here = row(y);
         let (before, middle, after) = if down {
@@ -340,13 +342,20 @@ fn samples(width: usize, height: usize, row: Row<'_>, steps: usize, rows: usize)
         } else {
             (&here[..], here.get(lag..).unwrap_or_default(), here.get(2 * lag..).unwrap_or_default())
         };
-        // Some of the pixels: what neighbours say is much the same.
-        let three =
-            before.iter().zip(middle).zip(after).skip(y % STRIDE).step_by(STRIDE).map(|((&a, &b), &c)| [a, b, c]);
+        let three = before.iter().zip(middle).zip(after).skip(y % stride).step_by(stride);
+        let three = three.map(|((&a, &b), &c)| [a, b, c]);
         three.filter(|t| t.iter().all(|p| p.is_finite())).collect()
     };
-    let found: Vec<Vec<Three>> = lags.iter().cycle().take(count).enumerate().map(look).collect();
-    (found.iter().map(Vec::len).sum::<usize>() >= FEWEST).then_some(found)
+    let taken = |stride: usize| -> Vec<Vec<Three>> {
+        lags.iter().cycle().take(count).enumerate().map(|at| look(at, stride)).collect()
+    };
+    let total = |found: &[Vec<Three>]| found.iter().map(Vec::len).sum::<usize>();
+    let mut found = taken((width / PER_ROW).max(1));
+    // Little of the image shows fringes (three spheres, say): then all of it counts.
+    if width > PER_ROW && total(&found) < count * PER_ROW / 2 {
+        found = taken(1);
+    }
+    (total(&found) >= FEWEST).then_some(found)
 }
 
 /// An error under trial: coefficients in turns, in the true phase and in the measured one.

@@ -223,6 +223,7 @@ def write_response(path: str | os.PathLike[str], response: Response) -> None:
 def gamma_of_second_harmonic(ratio: float) -> float:
     """Return the power law's exponent whose second harmonic is this part of the fundamental, (g - 1)/(g + 2).
 
+    >>> from weldscan import harmonics_of_gamma
     >>> round(gamma_of_second_harmonic(harmonics_of_gamma(1.8)[0]), 6)
     1.8
     """

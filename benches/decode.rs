@@ -7,6 +7,10 @@ use criterion::{Criterion, criterion_group, criterion_main};
 use weldcore::phase::{DecodeOptions, FringeSet, Shot, decode_phase, decode_shot};
 use weldcore::unwrap::unwrap_spatial;
 
+#[cfg(not(feature = "python"))] // which brings it along
+#[global_allocator]
+static ALLOCATOR: weldcore::memory::Recycler = weldcore::memory::Recycler;
+
 const WIDTH: usize = 1280;
 const HEIGHT: usize = 960;
 const SETS: [FringeSet; 3] =

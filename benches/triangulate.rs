@@ -8,6 +8,10 @@ use weldcore::scanner::{Lens, Scanner};
 use weldcore::transform::Transform;
 use weldcore::triangulate::{Axis, triangulate};
 
+#[cfg(not(feature = "python"))] // which brings it along
+#[global_allocator]
+static ALLOCATOR: weldcore::memory::Recycler = weldcore::memory::Recycler;
+
 fn scanner() -> weldcore::Result<Scanner> {
     let camera = Lens::new(1280, 960, [2650.0, 2648.0], [647.5, 474.5], [-0.09, 0.12, 4e-4, -3e-4, 0.0])?;
     let projector = Lens::new(1280, 800, [2150.0; 2], [639.5, 399.5], [0.03, -0.02, 0.0, 0.0, 0.0])?;

@@ -28,6 +28,7 @@
 //! | [`segment`] | reference wall, other wall and bead |
 //! | [`place`] | the shots of a part joined into one cloud in base |
 //! | [`step`] | the step around the seam and its uncertainty |
+//! | [`memory`] | large results without the cost of fresh memory |
 //! | [`image`] | grey PNG files, read strictly |
 //! | [`simulate`] | ray-cast fringe images of analytic scenes |
 
@@ -37,7 +38,7 @@ pub mod fit;
 pub mod icp;
 pub mod image;
 pub mod kdtree;
-mod memory;
+pub mod memory;
 pub mod mesh;
 pub mod normals;
 pub mod phase;

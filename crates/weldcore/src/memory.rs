@@ -1,21 +1,120 @@
-//! Large arrays of zeros.
+//! Large arrays without the cost of fresh memory.
+//!
+//! The system hands out fresh memory page by page and clears each page at its first touch: for the 26 MB that decoding one
+//! shot returns, that takes longer than computing what goes into them. [`Recycler`] keeps large blocks that were given
+//! back for the next large result, and asks for huge pages where the system offers them on request.
 
-/// From this size on huge pages are asked for: below, there is little to gain.
-const LARGE_BYTES: usize = 4 << 20;
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::mem::MaybeUninit;
+use std::sync::Mutex;
 
-/// A vector of zeros for a large result. Where the system offers huge pages on request (as Linux mostly does) they are
-/// requested: touching the fresh memory of a scan page by page costs more than computing what goes into it.
-pub(crate) fn zeros<T: Copy + Default>(n: usize) -> Vec<T> {
-    let values = vec![T::default(); n];
-    let bytes = n * size_of::<T>();
-    if bytes >= LARGE_BYTES {
-        request_huge_pages(values.as_ptr().cast(), bytes);
+/// From this size on blocks are kept, and huge pages asked for: below, there is little to gain.
+const LARGE_BYTES: usize = 1 << 20;
+/// What is kept at most: the results of a shot of a few megapixels.
+const KEPT_BYTES: usize = 160 << 20;
+const KEPT_BLOCKS: usize = 48;
+
+/// The allocator of the Python module: the system's, but for large blocks, of which up to 160 MB are kept when they are
+/// freed and handed out again. A Rust program may choose it, too, by `#[global_allocator]`.
+#[derive(Debug)]
+pub struct Recycler;
+
+struct Kept {
+    /// Address and size; the first `count` are in use.
+    blocks: [(usize, usize); KEPT_BLOCKS],
+    count: usize,
+    bytes: usize,
+}
+
+static KEPT: Mutex<Kept> = Mutex::new(Kept { blocks: [(0, 0); KEPT_BLOCKS], count: 0, bytes: 0 });
+
+impl Kept {
+    fn take(&mut self, size: usize) -> Option<*mut u8> {
+        // The last one in is the one most likely to be in the cache.
+        let at = self.blocks.iter().take(self.count).rposition(|b| b.1 == size)?;
+        let (address, _) = *self.blocks.get(at)?;
+        self.count -= 1;
+        self.blocks.copy_within(at + 1..=self.count, at);
+        self.bytes -= size;
+        Some(std::ptr::with_exposed_provenance_mut(address))
     }
-    values
+
+    fn keep(&mut self, block: *mut u8, size: usize) -> bool {
+        if self.bytes + size > KEPT_BYTES {
+            return false;
+        }
+        let Some(slot) = self.blocks.get_mut(self.count) else { return false };
+        *slot = (block.expose_provenance(), size);
+        self.count += 1;
+        self.bytes += size;
+        true
+    }
+}
+
+/// The layout that a large block really has: rounded up by at most an eighth, so that results of nearly the same size
+/// share blocks. `None` for what the system serves alone.
+fn large(layout: Layout) -> Option<Layout> {
+    const ALIGNED: usize = 16;
+    if layout.size() < LARGE_BYTES || layout.align() > ALIGNED {
+        return None;
+    }
+    let grain = layout.size().checked_next_power_of_two()? / 16;
+    Layout::from_size_align(layout.size().checked_next_multiple_of(grain)?, ALIGNED).ok()
+}
+
+/// A kept block. Another thread at the list, perhaps one that a fork has cut off, is not waited for.
+fn recycled(block: Layout) -> Option<*mut u8> {
+    KEPT.try_lock().ok()?.take(block.size())
+}
+
+// SAFETY: every block comes from `System` with the layout that `large` derives from the caller's, and goes back to it
+// with the same; a kept block is in the list once, and is out of it before it is handed out.
+unsafe impl GlobalAlloc for Recycler {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        let Some(block) = large(layout) else { return unsafe { System.alloc(layout) } };
+        recycled(block).unwrap_or_else(|| request_huge_pages(unsafe { System.alloc(block) }, block.size()))
+    }
+
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        let Some(block) = large(layout) else { return unsafe { System.alloc_zeroed(layout) } };
+        match recycled(block) {
+            Some(start) => {
+                unsafe { start.write_bytes(0, layout.size()) };
+                start
+            }
+            None => request_huge_pages(unsafe { System.alloc_zeroed(block) }, block.size()),
+        }
+    }
+
+    unsafe fn dealloc(&self, start: *mut u8, layout: Layout) {
+        let Some(block) = large(layout) else { return unsafe { System.dealloc(start, layout) } };
+        let kept = KEPT.try_lock().is_ok_and(|mut list| list.keep(start, block.size()));
+        if !kept {
+            unsafe { System.dealloc(start, block) };
+        }
+    }
+
+    unsafe fn realloc(&self, start: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        let Ok(wanted) = Layout::from_size_align(size, layout.align()) else { return std::ptr::null_mut() };
+        match (large(layout), large(wanted)) {
+            (None, None) => unsafe { System.realloc(start, layout, size) },
+            (Some(old), Some(new)) if old == new => start,
+            // Large blocks grow by moving their pages, not their bytes.
+            (Some(old), Some(new)) => unsafe { System.realloc(start, old, new.size()) },
+            _ => unsafe {
+                let moved = self.alloc(wanted);
+                if !moved.is_null() {
+                    moved.copy_from_nonoverlapping(start, size.min(layout.size()));
+                    self.dealloc(start, layout);
+                }
+                moved
+            },
+        }
+    }
 }
 
 #[cfg(target_os = "linux")]
-fn request_huge_pages(start: *const u8, bytes: usize) {
+fn request_huge_pages(start: *mut u8, bytes: usize) -> *mut u8 {
     use std::ffi::{c_int, c_void};
     unsafe extern "C" {
         fn madvise(start: *mut c_void, length: usize, advice: c_int) -> c_int;
@@ -23,24 +122,106 @@ fn request_huge_pages(start: *const u8, bytes: usize) {
     const MADV_HUGEPAGE: c_int = 14;
     const PAGE: usize = 4096;
     let skip = start.align_offset(PAGE);
-    if skip < bytes {
+    if !start.is_null() && skip < bytes {
         // SAFETY: the pages lie within a live allocation, and the advice changes neither their contents nor their
         // protection. A refusal leaves everything as it is, so the answer does not matter.
-        unsafe { madvise(start.add(skip).cast_mut().cast(), (bytes - skip) / PAGE * PAGE, MADV_HUGEPAGE) };
+        unsafe { madvise(start.add(skip).cast(), (bytes - skip) / PAGE * PAGE, MADV_HUGEPAGE) };
     }
+    start
 }
 
 #[cfg(not(target_os = "linux"))]
-fn request_huge_pages(_: *const u8, _: usize) {}
+fn request_huge_pages(start: *mut u8, _: usize) -> *mut u8 {
+    start
+}
+
+/// `n` zeros.
+pub(crate) fn zeros<T: Copy + Default>(n: usize) -> Vec<T> {
+    vec![T::default(); n]
+}
+
+/// Room for `n` values that are all going to be written: clearing it first would take as long as writing it.
+pub(crate) fn room<T: Copy>(n: usize) -> Vec<MaybeUninit<T>> {
+    let mut values = Vec::with_capacity(n);
+    // SAFETY: the capacity is there, and values that may be uninitialised need no initialising.
+    unsafe { values.set_len(n) };
+    values
+}
+
+/// Writes the first of `values` into a part of a room, as many as it holds.
+#[inline]
+pub(crate) fn fill<T: Copy>(room: &mut [MaybeUninit<T>], values: &[T]) {
+    room.iter_mut().zip(values).for_each(|(r, v)| *r = MaybeUninit::new(*v));
+}
+
+/// The values of a room in which every place has been written.
+///
+/// # Safety
+/// Every place has been written.
+pub(crate) unsafe fn filled<T: Copy>(room: Vec<MaybeUninit<T>>) -> Vec<T> {
+    let mut room = std::mem::ManuallyDrop::new(room);
+    // SAFETY: the same allocation with the same layout; the caller vouches for the contents.
+    unsafe { Vec::from_raw_parts(room.as_mut_ptr().cast(), room.len(), room.capacity()) }
+}
 
 #[cfg(test)]
 mod tests {
+    use super::*;
+
+    /// Blocks of this test alone: no other asks for this size.
+    fn layout(extra: usize) -> Layout {
+        Layout::from_size_align(7 * LARGE_BYTES + extra, 8).unwrap()
+    }
+
     #[test]
-    fn zeros_are_zero_at_any_size() {
-        for n in [0, 1, 1000, 3_000_001] {
-            let values = super::zeros::<[f64; 3]>(n);
-            assert_eq!(values.len(), n);
-            assert!(values.iter().all(|v| *v == [0.0; 3]));
+    fn a_freed_block_comes_back_for_a_result_of_nearly_its_size_and_is_cleared_where_zeros_are_asked_for() {
+        unsafe {
+            let first = Recycler.alloc(layout(0));
+            first.write_bytes(7, layout(0).size());
+            Recycler.dealloc(first, layout(0));
+            let again = Recycler.alloc_zeroed(layout(0));
+            assert_eq!(first, again);
+            let bytes = std::slice::from_raw_parts(again, layout(0).size());
+            assert!(bytes.iter().all(|b| *b == 0));
+            // Shrinking and growing within the block moves nothing; beyond, the contents move along.
+            again.write_bytes(5, 100);
+            let same = Recycler.realloc(again, layout(0), layout(0).size() - 5);
+            assert_eq!(again, same);
+            let small = Recycler.realloc(same, Layout::from_size_align(layout(0).size() - 5, 8).unwrap(), 1000);
+            let bytes = std::slice::from_raw_parts(small, 100);
+            assert!(bytes.iter().all(|b| *b == 5));
+            let large = Recycler.realloc(small, Layout::from_size_align(1000, 8).unwrap(), 9 * LARGE_BYTES);
+            let larger =
+                Recycler.realloc(large, Layout::from_size_align(9 * LARGE_BYTES, 8).unwrap(), 20 * LARGE_BYTES);
+            let bytes = std::slice::from_raw_parts(larger, 100);
+            assert!(bytes.iter().all(|b| *b == 5));
+            Recycler.dealloc(larger, Layout::from_size_align(20 * LARGE_BYTES, 8).unwrap());
         }
+    }
+
+    #[test]
+    fn no_more_is_kept_than_the_limit() {
+        let mut kept = Kept { blocks: [(0, 0); KEPT_BLOCKS], count: 0, bytes: 0 };
+        let block = std::ptr::without_provenance_mut(64);
+        assert!(!kept.keep(block, KEPT_BYTES + 1));
+        for _ in 0..KEPT_BLOCKS {
+            assert!(kept.keep(block, LARGE_BYTES));
+        }
+        assert!(!kept.keep(block, LARGE_BYTES));
+        assert_eq!(kept.take(3), None);
+        for _ in 0..KEPT_BLOCKS {
+            assert_eq!(kept.take(LARGE_BYTES), Some(block));
+        }
+        assert_eq!((kept.take(LARGE_BYTES), kept.bytes), (None, 0));
+    }
+
+    #[test]
+    fn rounding_up_wastes_an_eighth_at_most() {
+        for size in (LARGE_BYTES..40 * LARGE_BYTES).step_by(99_991) {
+            let block = large(Layout::from_size_align(size, 8).unwrap()).unwrap();
+            assert!(block.size() >= size && block.size() - size <= size / 8);
+        }
+        assert_eq!(large(Layout::from_size_align(1000, 8).unwrap()), None);
+        assert_eq!(large(Layout::from_size_align(4 * LARGE_BYTES, 64).unwrap()), None);
     }
 }

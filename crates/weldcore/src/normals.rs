@@ -1,14 +1,17 @@
 //! Surface normals, from the pixel grid and from a bare cloud.
 
+use std::mem::MaybeUninit;
+
 use multiversion::multiversion;
 use rayon::prelude::*;
 
 use crate::error::{Error, Result, require_count};
 use crate::kdtree::{Aside, KdTree, Nearby};
+use crate::memory::{filled, room};
 use crate::threads;
 
 /// Rows of the grid handed to a thread at a time.
-const ROWS: usize = 16;
+const ROWS: usize = 32;
 /// Pixels of a row treated side by side, so that their sums stay in the nearest cache.
 const SIDE_BY_SIDE: usize = 32;
 /// Neighbours this many times further apart than pixels commonly are lie across a jump: a surface seen so obliquely
@@ -38,14 +41,15 @@ pub fn of_grid(points: &[[f64; 3]], width: usize, window: usize, viewpoint: [f64
         let expected = "odd, from 3 to 1023".into();
         return Err(Error::OutOfRange { what: "window", expected, value: window.to_string() });
     }
-    let mut normals = vec![[f64::NAN; 3]; points.len()];
+    let mut normals = room::<[f64; 3]>(points.len());
     let jump = JUMP * common_distance(points, width);
     threads::install(|| {
         normals.par_chunks_mut(ROWS * width).enumerate().for_each(|(strip, normals)| {
             of_strip(&Grid { points, width, reach: window / 2, jump, viewpoint }, strip * ROWS, normals);
         });
     });
-    Ok(normals)
+    // SAFETY: the strips cover the points, and `of_strip` writes every normal of its own.
+    Ok(unsafe { filled(normals) })
 }
 
 /// The median distance of neighbours in a row, over every third pair; 0 where there are none.
@@ -136,57 +140,187 @@ fn add_row(sums: &mut Sums, of_row: &RowSums, i: f64) {
     }
 }
 
+/// What the windows around a line of pixels take from one row, where no neighbours in it lie across a jump: the sums over
+/// the window's width of p and of j p.
+struct Line {
+    /// No jump along the row, nor down to the next one.
+    even: [bool; 2],
+    sums: [[Lanes; 2]; 3],
+}
+
+/// Neighbours that are closer than this, squared, each to each, leave no pixel of a window across a jump: the way to it
+/// is |i| + |j| steps, at most the root of two times the distance over which `jump` is counted.
+fn even_step(jump: f64) -> f64 {
+    0.5 * jump * jump
+}
+
+/// Whether all neighbours of two rows of points, at the same place in each, are closer than that.
+#[inline(always)]
+fn is_even(here: [&[f64]; 3], there: [&[f64]; 3], limit: f64) -> bool {
+    let [hx, hy, hz] = here;
+    let [tx, ty, tz] = there;
+    let mut jumps = 0u64;
+    for ((hx, hy, hz), (tx, ty, tz)) in hx
+        .iter()
+        .zip(hy)
+        .zip(hz)
+        .map(|((x, y), z)| (x, y, z))
+        .zip(tx.iter().zip(ty).zip(tz).map(|((x, y), z)| (x, y, z)))
+    {
+        let (x, y, z) = (hx - tx, hy - ty, hz - tz);
+        // False for NaN.
+        let even = x * x + y * y + z * z <= limit;
+        jumps |= u64::from(!even);
+    }
+    jumps == 0
+}
+
+/// The line that starts at `from` in the planes; the windows reach `reach` pixels to both sides of its lanes.
+#[inline(always)]
+fn line(planes: &[Vec<f64>; 3], from: usize, stride: usize, reach: usize, limit: f64) -> Line {
+    let width = SIDE_BY_SIDE + 2 * reach;
+    let part = |at: usize, n: usize| -> [&[f64]; 3] {
+        let [x, y, z] = planes;
+        [x, y, z].map(|plane| plane.get(at..at + n).unwrap_or_default())
+    };
+    let along = is_even(part(from, width - 1), part(from + 1, width - 1), limit);
+    let down = part(from + stride, width);
+    let mut line = Line {
+        even: [along, !down[0].is_empty() && is_even(part(from, width), down, limit)],
+        sums: [[[0.0; SIDE_BY_SIDE]; 2]; 3],
+    };
+    if along {
+        for (plane, [sum, tilt]) in planes.iter().zip(&mut line.sums) {
+            for shift in 0..=2 * reach {
+                let j = shift as f64 - reach as f64;
+                let Some(lanes) = plane.get(from + shift..).and_then(|p| p.first_chunk::<SIDE_BY_SIDE>()) else {
+                    continue;
+                };
+                for k in 0..SIDE_BY_SIDE {
+                    sum[k] += lanes[k];
+                    tilt[k] += j * lanes[k];
+                }
+            }
+        }
+    }
+    line
+}
+
+/// Twice the tangents of the windows around a line of pixels, down and along, up to a factor above zero.
+type Tangents = [[Lanes; 3]; 2];
+
+/// Where every pixel of the windows counts: sums of sums.
+#[inline(always)]
+fn even_tangents(lines: &[Line]) -> Tangents {
+    let mut tangents = [[[0.0; SIDE_BY_SIDE]; 3]; 2];
+    let [down, along] = &mut tangents;
+    let reach = lines.len() / 2;
+    for (i, line) in lines.iter().enumerate() {
+        let i = i as f64 - reach as f64;
+        for ([sum, tilt], (u, v)) in line.sums.iter().zip(down.iter_mut().zip(along.iter_mut())) {
+            for k in 0..SIDE_BY_SIDE {
+                u[k] += i * sum[k];
+                v[k] += tilt[k];
+            }
+        }
+    }
+    tangents
+}
+
+/// Where pixels are missing, or lie across a jump: NaN where the rest fixes no plane.
+#[inline(always)]
+fn torn_tangents(s: &Sums) -> Tangents {
+    let mut tangents = [[[0.0; SIDE_BY_SIDE]; 3]; 2];
+    for k in 0..SIDE_BY_SIDE {
+        // What is left of the sums when row and column are taken from their means.
+        let per_n = 1.0 / s[0][k];
+        let [ii, ij, jj] = [(3, 1, 1), (4, 1, 2), (5, 2, 2)].map(|(m, a, b)| s[m][k] - s[a][k] * s[b][k] * per_n);
+        // The tangents are the inverse of [[ii, ij], [ij, jj]] times these: their cross product is theirs times a
+        // number above zero. A window of whole steps has no determinant between 0 and 1/n.
+        let fixed = (ii * jj - ij * ij) * s[0][k] > 0.5;
+        for a in 0..3 {
+            let [u, v] = [(1, 9), (2, 12)].map(|(m, p)| s[p + a][k] - s[m][k] * s[6 + a][k] * per_n);
+            tangents[0][a][k] = if fixed { u } else { f64::NAN };
+            tangents[1][a][k] = if fixed { v } else { f64::NAN };
+        }
+    }
+    tangents
+}
+
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw", "x86_64+avx2"))]
-fn of_strip(grid: &Grid, first: usize, normals: &mut [[f64; 3]]) {
+fn of_strip(grid: &Grid, first: usize, normals: &mut [MaybeUninit<[f64; 3]>]) {
+    plain_of_strip(grid, first, normals);
+}
+
+/// The body of [`of_strip`], and its fallback.
+#[inline(always)]
+fn plain_of_strip(grid: &Grid, first: usize, normals: &mut [MaybeUninit<[f64; 3]>]) {
     let (width, reach) = (grid.width, grid.reach);
     let rows = normals.len() / width;
     let (top, height) = (first.saturating_sub(reach), grid.points.len() / width);
     let bottom = (first + rows + reach).min(height);
-    // Coordinate by coordinate, with a margin of NaN at both ends of the rows.
+    // Coordinate by coordinate, relative to a point of the strip: no cancellation far from the origin. With a margin of
+    // NaN at both ends of the rows.
     let stride = width + 2 * reach + SIDE_BY_SIDE;
-    let mut planes = [vec![], vec![], vec![]];
-    for (axis, plane) in planes.iter_mut().enumerate() {
-        *plane = vec![f64::NAN; stride * (bottom - top)];
-        let rows = grid.points[top * width..bottom * width].chunks(width);
-        for (to, from) in plane.chunks_mut(stride).zip(rows) {
-            for (to, p) in to[reach..].iter_mut().zip(from) {
-                *to = p[axis];
-            }
+    let inside = grid.points.get(top * width..bottom * width).unwrap_or_default();
+    let origin = inside.iter().find(|p| p.iter().all(|c| c.is_finite())).copied().unwrap_or_default();
+    let mut planes = [0; 3].map(|_| vec![f64::NAN; stride * (bottom - top)]);
+    for (r, from) in inside.chunks(width).enumerate() {
+        let [xs, ys, zs] = &mut planes;
+        let at = r * stride + reach;
+        let [Some(xs), Some(ys), Some(zs)] = [xs, ys, zs].map(|plane| plane.get_mut(at..at + width)) else { continue };
+        for (p, (x, (y, z))) in from.iter().zip(xs.iter_mut().zip(ys.iter_mut().zip(zs))) {
+            (*x, *y, *z) = (p[0] - origin[0], p[1] - origin[1], p[2] - origin[2]);
         }
     }
-    let [xs, ys, zs] = &planes;
-    for (r, normals) in normals.chunks_mut(width).enumerate() {
-        let row = first + r;
-        let (low, high) = (row.saturating_sub(reach).max(top), (row + reach + 1).min(bottom));
-        for (block, normals) in normals.chunks_mut(SIDE_BY_SIDE).enumerate() {
-            let left = block * SIDE_BY_SIDE;
-            let here = (row - top) * stride + left + reach;
-            let Some(centre) = side_by_side([xs, ys, zs], here) else { continue };
-            let mut sums: Sums = [[0.0; SIDE_BY_SIDE]; 15];
-            for near in low..high {
-                let i = near as f64 - row as f64;
-                let mut of_row: RowSums = [[0.0; SIDE_BY_SIDE]; 9];
-                for shift in 0..=2 * reach {
-                    let j = shift as f64 - reach as f64;
-                    let Some(there) = side_by_side([xs, ys, zs], (near - top) * stride + left + shift) else {
-                        continue;
-                    };
-                    add_pixels(&mut of_row, centre, there, j, (grid.jump * grid.jump) * (i * i + j * j));
+    let eye = [0, 1, 2].map(|a| grid.viewpoint[a] - origin[a]);
+    let limit = even_step(grid.jump);
+    let mut lines: Vec<Line> = Vec::new();
+    for block in 0..width.div_ceil(SIDE_BY_SIDE) {
+        let left = block * SIDE_BY_SIDE;
+        let lanes = SIDE_BY_SIDE.min(width - left);
+        lines.clear();
+        for r in 0..bottom - top {
+            lines.push(line(&planes, r * stride + left, stride, reach, limit));
+        }
+        for r in 0..rows {
+            let row = first + r;
+            let here = (row - top) * stride + left;
+            let [xs, ys, zs] = &planes;
+            let Some(centre) = side_by_side([xs, ys, zs], here + reach) else { continue };
+            let window = (row + reach < height)
+                .then(|| lines.get((row - top).checked_sub(reach)?..=row - top + reach))
+                .flatten()
+                .filter(|window| window.iter().all(|l| l.even[0]))
+                .filter(|window| window.iter().take(2 * reach).all(|l| l.even[1]));
+            let [u, v] = match window {
+                Some(window) => even_tangents(window),
+                None => {
+                    let mut sums: Sums = [[0.0; SIDE_BY_SIDE]; 15];
+                    for near in row.saturating_sub(reach).max(top)..(row + reach + 1).min(bottom) {
+                        let i = near as f64 - row as f64;
+                        let mut of_row: RowSums = [[0.0; SIDE_BY_SIDE]; 9];
+                        for shift in 0..=2 * reach {
+                            let j = shift as f64 - reach as f64;
+                            let there = side_by_side([xs, ys, zs], (near - top) * stride + left + shift);
+                            let Some(there) = there else { continue };
+                            add_pixels(&mut of_row, centre, there, j, (grid.jump * grid.jump) * (i * i + j * j));
+                        }
+                        add_row(&mut sums, &of_row, i);
+                    }
+                    torn_tangents(&sums)
                 }
-                add_row(&mut sums, &of_row, i);
+            };
+            let mut found = [[0.0; SIDE_BY_SIDE]; 3];
+            for k in 0..SIDE_BY_SIDE {
+                let of = |t: &[Lanes; 3]| [t[0][k], t[1][k], t[2][k]];
+                let to_eye = [eye[0] - centre[0][k], eye[1] - centre[1][k], eye[2] - centre[2][k]];
+                let normal = towards(&cross(&of(&u), &of(&v)), &to_eye);
+                (found[0][k], found[1][k], found[2][k]) = (normal[0], normal[1], normal[2]);
             }
+            let normals = normals.get_mut(r * width + left..r * width + left + lanes).unwrap_or_default();
             for (k, normal) in normals.iter_mut().enumerate() {
-                let s = |n: usize| sums[n][k];
-                let n = s(0);
-                // What is left of the sums when row and column are taken from their means.
-                let (ii, ij, jj) = (s(3) - s(1) * s(1) / n, s(4) - s(1) * s(2) / n, s(5) - s(2) * s(2) / n);
-                let [u, v] = [(1, 9), (2, 12)].map(|(m, p)| [0, 1, 2].map(|a| s(p + a) - s(m) * s(6 + a) / n));
-                // The tangents are the inverse of [[ii, ij], [ij, jj]] times u and v: their cross product is that of u
-                // and v, times a number above zero. A window of whole steps has no determinant between 0 and 1/n.
-                let determinant = ii * jj - ij * ij;
-                let at = here + k;
-                let to_eye = [grid.viewpoint[0] - xs[at], grid.viewpoint[1] - ys[at], grid.viewpoint[2] - zs[at]];
-                *normal = if determinant * n > 0.5 { towards(&cross(&u, &v), &to_eye) } else { [f64::NAN; 3] };
+                *normal = MaybeUninit::new([found[0][k], found[1][k], found[2][k]]);
             }
         }
     }

@@ -3,20 +3,28 @@
 //! A camera pixel is a ray `z (x, y, 1)`; a projector column is a surface, a plane but for the projector's lens. In the
 //! projector's frame the ray at `s = 1/z` is seen in the direction `((q + s t) / (q_z + s t_z))`, with q the rotated
 //! ray and t the camera's place: one unknown, found by Newton on the distorted column, exactly with both lenses. The
-//! start is the plane without the lens.
+//! start is the plane without the lens. Each step doubles the digits, so the first two are taken in single precision,
+//! at twice the speed, and the last two in double.
+
+// Several arrays run in step through the kernel: there an index is plainer than a tower of zips.
+#![allow(clippy::needless_range_loop)]
+
+use std::mem::MaybeUninit;
+use std::ops::{Add, Div, Mul, Sub};
 
 use multiversion::multiversion;
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
-use crate::memory::zeros;
+use crate::memory::{fill, filled, room};
 use crate::scanner::{Lens, Rays, Scanner};
 use crate::threads::{self, CHUNK};
 
 /// Pixels that the kernel takes at a time.
 const TILE: usize = 128;
-/// Newton doubles the digits: from the 1e-2 of a strong lens to the last digit takes four steps. Where it has not come down to this (normalised coordinates) the ray does not meet the column.
-const CONVERGED: f64 = 1e-11;
+/// Where the last step of Newton starts from a larger miss than this (normalised coordinates), the ray does not meet the
+/// column. What is left after it is of the order of the square.
+const CLOSE: f64 = 1e-7;
 
 /// Which way the fringes run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,14 +48,108 @@ pub struct Cloud {
     pub sigma_mm: Vec<f32>,
 }
 
-/// The numbers of a tile's problem, the projector turned so that the measured coordinate is the first.
-struct Problem {
+/// Single or double precision.
+trait Real: Copy + From<f32> + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> {}
+impl Real for f32 {}
+impl Real for f64 {}
+
+/// The projector, turned so that the measured coordinate is the first.
+struct View<T> {
     /// Rows of projector_from_camera's rotation, measured coordinate first, then the other, then z; and its translation.
-    rotation: [[f64; 3]; 3],
-    translation: [f64; 3],
-    k: [f64; 3],
+    rotation: [[T; 3]; 3],
+    translation: [T; 3],
+    k: [T; 3],
     /// Tangential terms: p[0] belongs to the measured coordinate.
-    p: [f64; 2],
+    p: [T; 2],
+}
+
+/// What the projector sees of a camera ray at s = 1/z.
+struct Look<T> {
+    /// Measured coordinate less its aim, normalised and distorted; and its derivative by s.
+    miss: T,
+    slope: T,
+    /// The other coordinate.
+    across: T,
+    /// Its distance from the projector, times s.
+    depth: T,
+}
+
+impl<T: Real> Look<T> {
+    #[inline(always)]
+    fn step(&self) -> T {
+        self.miss / self.slope
+    }
+}
+
+impl View<f64> {
+    fn new(scanner: &Scanner, axis: Axis) -> Self {
+        let pose = scanner.camera_from_projector.inverse();
+        let row = |r: usize| [pose.rotation[(r, 0)], pose.rotation[(r, 1)], pose.rotation[(r, 2)]];
+        let Lens { dist: [k1, k2, p1, p2, k3], .. } = scanner.projector;
+        let t = pose.translation;
+        let (first, second, p) = match axis {
+            Axis::X => (0, 1, [p2, p1]),
+            Axis::Y => (1, 0, [p1, p2]),
+        };
+        Self {
+            rotation: [row(first), row(second), row(2)],
+            translation: [t[first], t[second], t[2]],
+            k: [k1, k2, k3],
+            p,
+        }
+    }
+
+    fn narrow(&self) -> View<f32> {
+        View {
+            rotation: self.rotation.map(|row| row.map(|v| v as f32)),
+            translation: self.translation.map(|v| v as f32),
+            k: self.k.map(|v| v as f32),
+            p: self.p.map(|v| v as f32),
+        }
+    }
+}
+
+impl<T: Real> View<T> {
+    #[inline(always)]
+    fn turn(&self, x: T, y: T) -> [T; 3] {
+        let [a, b, c] = self.rotation;
+        [a[0] * x + a[1] * y + a[2], b[0] * x + b[1] * y + b[2], c[0] * x + c[1] * y + c[2]]
+    }
+
+    /// s where the turned ray meets the plane of the column, the lens left out.
+    #[inline(always)]
+    fn plane(&self, q: &[T; 3], aim: T) -> T {
+        (aim * q[2] - q[0]) / (self.translation[0] - aim * self.translation[2])
+    }
+
+    #[inline(always)]
+    fn look(&self, q: &[T; 3], aim: T, s: T) -> Look<T> {
+        let View { translation: t, k, p, .. } = self;
+        let (one, two, three, six) = (T::from(1.0), T::from(2.0), T::from(3.0), T::from(6.0));
+        let depth = q[2] + t[2] * s;
+        let inverse = one / depth;
+        let a = (q[0] + t[0] * s) * inverse;
+        let b = (q[1] + t[1] * s) * inverse;
+        // The lens, as in `Lens::distort`, and its slope along the ray.
+        let (aa, ab, bb) = (a * a, a * b, b * b);
+        let r2 = aa + bb;
+        let radial = one + r2 * (k[0] + r2 * (k[1] + r2 * k[2]));
+        let bend = two * (k[0] + r2 * (two * k[1] + r2 * three * k[2]));
+        let along_a = radial + aa * bend + two * p[1] * b + six * p[0] * a;
+        let along_b = ab * bend + two * p[1] * a + two * p[0] * b;
+        Look {
+            miss: a * radial + two * p[1] * ab + p[0] * (r2 + two * aa) - aim,
+            slope: (along_a * (t[0] - a * t[2]) + along_b * (t[1] - b * t[2])) * inverse,
+            across: b * radial + p[1] * (r2 + two * bb) + two * p[0] * ab,
+            depth,
+        }
+    }
+}
+
+/// The numbers of a tile's problem; of each pair the first belongs to the measured coordinate.
+struct Problem {
+    view: View<f64>,
+    narrow: View<f32>,
     focal: [f64; 2],
     centre: [f64; 2],
     size: [f64; 2],
@@ -55,20 +157,12 @@ struct Problem {
 
 impl Problem {
     fn new(scanner: &Scanner, axis: Axis) -> Self {
-        let pose = scanner.camera_from_projector.inverse();
-        let row = |r: usize| [pose.rotation[(r, 0)], pose.rotation[(r, 1)], pose.rotation[(r, 2)]];
-        let Lens { width, height, fx, fy, cx, cy, dist: [k1, k2, p1, p2, k3] } = scanner.projector;
-        let (first, second) = match axis {
-            Axis::X => (0, 1),
-            Axis::Y => (1, 0),
-        };
+        let Lens { width, height, fx, fy, cx, cy, .. } = scanner.projector;
         let swap = |a: f64, b: f64| if axis == Axis::X { [a, b] } else { [b, a] };
-        let t = pose.translation;
+        let view = View::new(scanner, axis);
         Self {
-            rotation: [row(first), row(second), row(2)],
-            translation: [t[first], t[second], t[2]],
-            k: [k1, k2, k3],
-            p: swap(p2, p1),
+            narrow: view.narrow(),
+            view,
             focal: swap(fx, fy),
             centre: swap(cx, cy),
             size: swap(width as f64, height as f64),
@@ -80,52 +174,19 @@ struct Tile {
     x: [f64; TILE],
     y: [f64; TILE],
     column: [f64; TILE],
-    sigma_px: [f32; TILE],
     z: [f64; TILE],
-    sigma_mm: [f32; TILE],
+    /// dz/dcolumn along the ray, mm per px.
+    per_px: [f32; TILE],
 }
 
-/// What the projector sees of a camera ray at s = 1/z.
-struct Look {
-    /// Measured coordinate less its aim, normalised and distorted; and its derivative by s.
-    miss: f64,
-    slope: f64,
-    /// The other coordinate.
-    across: f64,
-    /// Its distance from the projector, times s.
-    depth: f64,
-}
-
-impl Look {
-    #[inline(always)]
-    fn step(&self) -> f64 {
-        self.miss / self.slope
+impl Tile {
+    fn empty() -> Self {
+        let nan = [f64::NAN; TILE];
+        Self { x: nan, y: nan, column: nan, z: nan, per_px: [f32::NAN; TILE] }
     }
 }
 
-#[inline(always)]
-fn look(problem: &Problem, q: &[f64; 3], aim: f64, s: f64) -> Look {
-    let Problem { translation: t, k, p, .. } = problem;
-    let depth = q[2] + t[2] * s;
-    let inverse = 1.0 / depth;
-    let a = (q[0] + t[0] * s) * inverse;
-    let b = (q[1] + t[1] * s) * inverse;
-    // The lens, as in `Lens::distort`, and its slope along the ray.
-    let (aa, ab, bb) = (a * a, a * b, b * b);
-    let r2 = aa + bb;
-    let radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]));
-    let bend = 2.0 * (k[0] + r2 * (2.0 * k[1] + r2 * 3.0 * k[2]));
-    let along_a = radial + aa * bend + 2.0 * p[1] * b + 6.0 * p[0] * a;
-    let along_b = ab * bend + 2.0 * p[1] * a + 2.0 * p[0] * b;
-    Look {
-        miss: a * radial + 2.0 * p[1] * ab + p[0] * (r2 + 2.0 * aa) - aim,
-        slope: (along_a * (t[0] - a * t[2]) + along_b * (t[1] - b * t[2])) * inverse,
-        across: b * radial + p[1] * (r2 + 2.0 * bb) + 2.0 * p[0] * ab,
-        depth,
-    }
-}
-
-/// Depth along each ray, and its standard deviation.
+/// Depth along each ray, and how fast it changes with the column.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
 fn solve(problem: &Problem, tile: &mut Tile) {
     plain_solve(problem, tile);
@@ -134,36 +195,46 @@ fn solve(problem: &Problem, tile: &mut Tile) {
 /// The body of [`solve`], and its fallback.
 #[inline(always)]
 fn plain_solve(problem: &Problem, tile: &mut Tile) {
-    let Problem { rotation: r, translation: t, focal, centre, size, .. } = problem;
+    let Problem { view, narrow, focal, centre, size } = problem;
+    let per_focal = 1.0 / focal[0];
+    // Loops of one precision each: the compiler makes vectors of their full width. Newton's steps are written out, for
+    // it makes vectors of a loop only where that holds no other.
+    let (mut x, mut y, mut aims, mut start) = ([0f32; TILE], [0f32; TILE], [0f32; TILE], [0f32; TILE]);
     for i in 0..TILE {
-        let (x, y) = (tile.x[i], tile.y[i]);
-        let q = [
-            r[0][0] * x + r[0][1] * y + r[0][2],
-            r[1][0] * x + r[1][1] * y + r[1][2],
-            r[2][0] * x + r[2][1] * y + r[2][2],
-        ];
-        let aim = (tile.column[i] - centre[0]) / focal[0];
-        let mut s = (aim * q[2] - q[0]) / (t[0] - aim * t[2]);
-        // Written out: the compiler makes vectors of a loop only where it holds no other.
-        s -= look(problem, &q, aim, s).step();
-        s -= look(problem, &q, aim, s).step();
-        s -= look(problem, &q, aim, s).step();
-        s -= look(problem, &q, aim, s).step();
-        let Look { miss, slope, across, depth } = look(problem, &q, aim, s);
-        let other = focal[1] * across + centre[1];
+        (x[i], y[i]) = (tile.x[i] as f32, tile.y[i] as f32);
+        aims[i] = ((tile.column[i] - centre[0]) * per_focal) as f32;
+    }
+    for i in 0..TILE {
+        let (q, aim) = (narrow.turn(x[i], y[i]), aims[i]);
+        let mut s = narrow.plane(&q, aim);
+        s -= narrow.look(&q, aim, s).step();
+        s -= narrow.look(&q, aim, s).step();
+        start[i] = s;
+    }
+    for i in 0..TILE {
+        let q = view.turn(tile.x[i], tile.y[i]);
         let column = tile.column[i];
-        let good = (miss.abs() < CONVERGED)
+        let aim = (column - centre[0]) * per_focal;
+        let mut s = f64::from(start[i]);
+        s -= view.look(&q, aim, s).step();
+        let look = view.look(&q, aim, s);
+        s -= look.step();
+        let other = focal[1] * look.across + centre[1];
+        let good = (look.miss.abs() < CLOSE)
             & (s > 0.0)
-            & (depth > 0.0)
+            & (look.depth > 0.0)
             & (column >= -0.5)
             & (column <= size[0] - 0.5)
             & (other >= -0.5)
             & (other <= size[1] - 0.5);
         let z = 1.0 / s;
-        // dz/dcolumn = -z² / (focal dmiss/ds), and along the ray times the length of (x, y, 1).
-        let per_px = z * z * (x * x + y * y + 1.0).sqrt() / (focal[0] * slope).abs();
         tile.z[i] = if good { z } else { f64::NAN };
-        tile.sigma_mm[i] = if good { (f64::from(tile.sigma_px[i]) * per_px) as f32 } else { f32::NAN };
+        // dz/dcolumn = -z² / (focal dmiss/ds); the rest is the length of (x, y, 1).
+        tile.per_px[i] = (z * z / (focal[0] * look.slope)) as f32;
+    }
+    for i in 0..TILE {
+        let length = (x[i] * x[i] + y[i] * y[i] + 1.0).sqrt();
+        tile.per_px[i] = tile.per_px[i].abs() * length;
     }
 }
 
@@ -184,51 +255,55 @@ pub fn triangulate(column_px: &[f64], scanner: &Scanner, sigma_px: Option<&[f32]
     }
     let problem = Problem::new(scanner, axis);
     let rays = scanner.camera_rays();
-    let mut points_mm = zeros::<[f64; 3]>(n);
-    let mut sigma_mm = zeros::<f32>(if sigma_px.is_some() { n } else { 0 });
+    let mut points_mm = room::<[f64; 3]>(n);
+    let mut sigma_mm = room::<f32>(sigma_px.map_or(0, <[f32]>::len));
     threads::install(|| match sigma_px {
         Some(sigma_px) => {
             let out = points_mm.par_chunks_mut(CHUNK).zip(sigma_mm.par_chunks_mut(CHUNK)).enumerate();
-            out.for_each(|(i, (p, s))| chunk(&problem, &rays, column_px, Some(sigma_px), i * CHUNK, p, s));
+            out.for_each(|(i, (p, s))| chunk(&problem, &rays, column_px, sigma_px, i * CHUNK, p, s));
         }
         None => {
             let out = points_mm.par_chunks_mut(CHUNK).enumerate();
-            out.for_each(|(i, p)| chunk(&problem, &rays, column_px, None, i * CHUNK, p, &mut []));
+            out.for_each(|(i, p)| chunk(&problem, &rays, column_px, &[], i * CHUNK, p, &mut []));
         }
     });
+    // SAFETY: the chunks cover the image, and `chunk` writes every place of its own.
+    let (points_mm, sigma_mm) = unsafe { (filled(points_mm), filled(sigma_mm)) };
     Ok(Cloud { width, height, points_mm, sigma_mm })
 }
 
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+fn place(tile: &Tile, points: &mut [MaybeUninit<[f64; 3]>]) {
+    for ((point, z), (x, y)) in points.iter_mut().zip(&tile.z).zip(tile.x.iter().zip(&tile.y)) {
+        *point = MaybeUninit::new([x * z, y * z, *z]);
+    }
+}
+
+/// Writes every point of a chunk, and every sigma where there are any.
 fn chunk(
     problem: &Problem,
     rays: &Rays,
     column: &[f64],
-    sigma_px: Option<&[f32]>,
+    sigma_px: &[f32],
     start: usize,
-    points: &mut [[f64; 3]],
-    sigma_mm: &mut [f32],
+    points: &mut [MaybeUninit<[f64; 3]>],
+    sigma_mm: &mut [MaybeUninit<f32>],
 ) {
-    let nan = [f64::NAN; TILE];
-    let mut tile = Tile { x: nan, y: nan, column: nan, sigma_px: [0.0; TILE], z: nan, sigma_mm: [0.0; TILE] };
+    let mut tile = Tile::empty();
     for (i, points) in points.chunks_mut(TILE).enumerate() {
-        let len = points.len();
-        let range = start + i * TILE..start + i * TILE + len;
-        let fill = |to: &mut [f64; TILE], from: &[f64]| {
-            to.iter_mut().zip(from.get(range.clone()).unwrap_or_default()).for_each(|(t, f)| *t = *f);
-        };
-        fill(&mut tile.x, &rays.x);
-        fill(&mut tile.y, &rays.y);
-        fill(&mut tile.column, column);
-        if let Some(sigma) = sigma_px.and_then(|s| s.get(range.clone())) {
-            tile.sigma_px.iter_mut().zip(sigma).for_each(|(t, f)| *t = *f);
+        let at = start + i * TILE;
+        for (to, from) in [(&mut tile.x, &rays.x[..]), (&mut tile.y, &rays.y), (&mut tile.column, column)] {
+            let from = from.get(at..at + points.len()).unwrap_or_default();
+            to.iter_mut().zip(from).for_each(|(t, f)| *t = *f);
         }
         solve(problem, &mut tile);
-        for (j, point) in points.iter_mut().enumerate().take(TILE) {
-            let z = tile.z[j];
-            *point = [tile.x[j] * z, tile.y[j] * z, z];
-        }
-        if let Some(sigma) = sigma_mm.get_mut(i * TILE..i * TILE + len) {
-            sigma.iter_mut().zip(&tile.sigma_mm).for_each(|(s, t)| *s = *t);
+        place(&tile, points);
+        if let (Some(out), Some(sigma_px)) = (sigma_mm.chunks_mut(TILE).nth(i), sigma_px.get(at..)) {
+            let mut sigma = [f32::NAN; TILE];
+            for (((sigma, px), per_px), z) in sigma.iter_mut().zip(sigma_px).zip(&tile.per_px).zip(&tile.z) {
+                *sigma = if z.is_nan() { f32::NAN } else { px * per_px };
+            }
+            fill(out, &sigma);
         }
     }
 }
@@ -472,19 +547,12 @@ mod tests {
         let (problem, rays) = (Problem::new(&scanner, Axis::X), scanner.camera_rays());
         let start = 100 * 320 + 64;
         let of = |v: &[f64]| -> [f64; TILE] { v[start..start + TILE].try_into().unwrap() };
-        let tile = || Tile {
-            x: of(&rays.x),
-            y: of(&rays.y),
-            column: of(&column),
-            sigma_px: [0.05; TILE],
-            z: [0.0; TILE],
-            sigma_mm: [0.0; TILE],
-        };
+        let tile = || Tile { x: of(&rays.x), y: of(&rays.y), column: of(&column), ..Tile::empty() };
         let (mut fast, mut plain) = (tile(), tile());
         solve(&problem, &mut fast);
         plain_solve(&problem, &mut plain);
         assert_eq!(fast.z.map(f64::to_bits), plain.z.map(f64::to_bits));
-        assert_eq!(fast.sigma_mm.map(f32::to_bits), plain.sigma_mm.map(f32::to_bits));
+        assert_eq!(fast.per_px.map(f32::to_bits), plain.per_px.map(f32::to_bits));
         assert!(fast.z.iter().any(|z| z.is_finite()));
     }
 

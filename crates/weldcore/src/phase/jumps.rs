@@ -6,23 +6,38 @@ use rayon::prelude::*;
 use super::{PhaseMap, Reason};
 use crate::threads;
 
+/// Rows that a thread takes at a time.
+const ROWS: usize = 32;
+
 /// Rejects pixels with a fringe order of their own: at most two of the eight neighbours within half a fringe, and more
 /// that are not. Surfaces, and their edges, leave three neighbours at least on a pixel's own side.
 pub(super) fn reject_jumps(map: &mut PhaseMap, half_fringe_px: f64) {
     let (width, column) = (map.width, &map.column_px);
-    let row_jumps = |row: usize| -> Vec<usize> {
-        let around = [row.checked_sub(1), Some(row), Some(row + 1)];
-        let rows: Vec<&[f64]> =
-            around.iter().flatten().filter_map(|r| column.get(r * width..(r + 1) * width)).collect();
-        let Some(own) = column.get(row * width..(row + 1) * width) else { return Vec::new() };
-        let (mut near, mut far) = (vec![0u8; width], vec![0u8; width]);
-        count_neighbours(own, &rows, half_fringe_px, &mut near, &mut far);
-        if !mark_jumps(&mut near, &far) {
-            return Vec::new();
+    let band_jumps = |band: usize| -> Vec<usize> {
+        // Single precision tells half a fringe from less, and is half the bytes. A border of NaN on all sides: whoever
+        // lies outside is neither near nor far.
+        let narrow = |row: Option<usize>| -> Vec<f32> {
+            let mut out = vec![f32::NAN; width + 2];
+            let own = row.and_then(|r| column.get(r * width..(r + 1) * width)).unwrap_or_default();
+            out.iter_mut().skip(1).zip(own).for_each(|(o, c)| *o = *c as f32);
+            out
+        };
+        let first = band * ROWS;
+        let last = (first + ROWS).min(map.height);
+        let (mut above, mut here) = (narrow(first.checked_sub(1)), narrow(Some(first)));
+        let mut jumps = vec![0u8; width];
+        let mut found = Vec::new();
+        for row in first..last {
+            let below = narrow(Some(row + 1));
+            if mark_jumps([&above, &here, &below], half_fringe_px as f32, &mut jumps) {
+                found.extend((0..width).zip(&jumps).filter(|(_, jump)| **jump > 0).map(|(i, _)| row * width + i));
+            }
+            (above, here) = (here, below);
         }
-        near.iter().enumerate().filter(|(_, jump)| **jump > 0).map(|(i, _)| row * width + i).collect()
+        found
     };
-    let found: Vec<Vec<usize>> = threads::install(|| (0..map.height).into_par_iter().map(row_jumps).collect());
+    let bands = map.height.div_ceil(ROWS);
+    let found: Vec<Vec<usize>> = threads::install(|| (0..bands).into_par_iter().map(band_jumps).collect());
     for at in found.into_iter().flatten() {
         if let (Some(c), Some(s), Some(r)) =
             (map.column_px.get_mut(at), map.sigma_px.get_mut(at), map.reason.get_mut(at))
@@ -32,32 +47,24 @@ pub(super) fn reject_jumps(map: &mut PhaseMap, half_fringe_px: f64) {
     }
 }
 
-/// Turns the counts in `near` into ones where there is a jump; says whether there is any.
+/// Ones where there is a jump in the middle one of three rows; says whether there is any.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
-fn mark_jumps(near: &mut [u8], far: &[u8]) -> bool {
+fn mark_jumps(rows: [&[f32]; 3], reach: f32, jumps: &mut [u8]) -> bool {
+    let width = jumps.len();
+    let [Some(above), Some(here), Some(below)] = rows.map(|r| r.get(..width + 2)) else { return false };
     let mut any = 0;
-    for (near, &far) in near.iter_mut().zip(far) {
-        // The pixel itself is among the near ones.
-        let jump = u8::from(*near >= 1) & u8::from(*near <= 3) & u8::from(far + 1 > *near);
-        *near = jump;
+    for i in 0..width {
+        let own = here[i + 1];
+        let around = [above[i], above[i + 1], above[i + 2], here[i], here[i + 2], below[i], below[i + 1], below[i + 2]];
+        let (mut near, mut far) = (0, 0);
+        for other in around {
+            let d = (own - other).abs();
+            near += i32::from(d < reach);
+            far += i32::from(d >= reach);
+        }
+        let jump = i32::from(near <= 2) & i32::from(far > near);
+        jumps[i] = jump as u8;
         any |= jump;
     }
     any > 0
-}
-
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
-fn count_neighbours(own: &[f64], rows: &[&[f64]], reach: f64, near: &mut [u8], far: &mut [u8]) {
-    for row in rows {
-        for shift in 0..3usize {
-            // Neighbour i + shift - 1 of pixel i.
-            let skip = usize::from(shift == 0);
-            let other = row.get(shift.saturating_sub(1)..).unwrap_or_default();
-            let (near, far) = (near.iter_mut().skip(skip), far.iter_mut().skip(skip));
-            for (((&a, &b), near), far) in own.iter().skip(skip).zip(other).zip(near).zip(far) {
-                let d = (a - b).abs();
-                *near += u8::from(d < reach);
-                *far += u8::from(d >= reach);
-            }
-        }
-    }
 }

@@ -7,7 +7,9 @@ use std::f64::consts::TAU;
 use multiversion::multiversion;
 
 use super::response::{self, PhaseError};
-use super::wave::{Lane, Level, Sinusoid, TILE, Wave, round, turns};
+use super::wave::{
+    Lane, Level, Sample, Sinusoid, TILE, Take, Wave, each_pixel, round, turns, turns_of, turns_quotient,
+};
 use super::{FringeSet, Noise, Reason, Shot};
 use crate::unwrap::Plan;
 
@@ -20,31 +22,40 @@ const HARMONIC_LIMIT: f64 = 0.35;
 /// hierarchy of ratio 8 needs all of it: 8 * 0.19 rad = 0.24 fringes.
 const MODEL_ERROR_FRINGES: f32 = 0.25;
 
-/// Fits the sinusoid to `len <= TILE` pixels from `start` on; the rest of the tile is padded.
-pub(super) fn demodulate<T: Level>(frames: &[&[T]], start: usize, len: usize, wave: &Wave, out: &mut Sinusoid) {
+/// Hands `take` the tile of `len <= TILE` pixels from `start` on; what is missing to a whole one is padded.
+fn tile_of<T: Level>(frames: &[&[T]], start: usize, len: usize, take: impl FnOnce(&[&[T; TILE]])) {
     let whole: Option<Vec<&[T; TILE]>> =
         frames.iter().map(|f| f.get(start..start + TILE).filter(|_| len == TILE)?.try_into().ok()).collect();
     if let Some(tiles) = whole {
-        return T::demodulate(&tiles, wave, out);
+        return take(&tiles);
     }
     let mut padded = vec![[T::default(); TILE]; frames.len()];
     for (tile, frame) in padded.iter_mut().zip(frames) {
         let pixels = frame.get(start..start + len).unwrap_or_default();
         tile.iter_mut().zip(pixels).for_each(|(t, p)| *t = *p);
     }
-    T::demodulate(&padded.iter().collect::<Vec<_>>(), wave, out);
+    take(&padded.iter().collect::<Vec<_>>());
+}
+
+/// Fits the sinusoid to `len <= TILE` pixels from `start` on.
+pub(super) fn demodulate<T: Level>(frames: &[&[T]], start: usize, len: usize, wave: &Wave, out: &mut Sinusoid) {
+    tile_of(frames, start, len, |tiles| T::demodulate(tiles, wave, out));
 }
 
 /// One fringe set of a tile, all exposures together.
-struct Fused {
+#[doc(hidden)]
+#[derive(Debug)]
+pub struct Fused {
     re: Lane,
     im: Lane,
     /// 1/sigma_phi², summed over the exposures.
     weight: Lane,
-    /// The largest single weight, and background and modulation of that exposure.
+    /// Why exposures were not usable, as a number.
+    why: Lane,
+    /// The largest single weight, and background and squared modulation of that exposure.
     best: Lane,
     background: Lane,
-    modulation: Lane,
+    modulation2: Lane,
     /// The phase in turns, and its variance.
     phase: Lane,
     variance: Lane,
@@ -70,9 +81,10 @@ impl Work {
             re: zero,
             im: zero,
             weight: zero,
+            why: zero,
             best: zero,
             background: zero,
-            modulation: zero,
+            modulation2: zero,
             phase: zero,
             variance: zero,
         };
@@ -90,72 +102,132 @@ impl Work {
 }
 
 /// What it takes to judge a sample of a set.
-struct Judge {
+#[doc(hidden)]
+#[derive(Debug)]
+pub struct Judge {
     floor: f32,
     gain: f32,
     saturation: f32,
     /// Half the number of steps.
     half: f32,
+    z: f32,
     /// On the residual: times the variance of a grey level, plus times the squared modulation.
     noise_limit: f32,
     harmonic_limit: f32,
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
-fn fuse(fit: &Sinusoid, judge: &Judge, first: bool, why: &mut Lane, out: &mut Fused) {
-    plain_fuse(fit, judge, first, why, out);
-}
+impl Judge {
+    /// Variance of a grey level in the sample, whether it is unsaturated, and whether it is a sinusoid.
+    #[inline(always)]
+    fn look(&self, s: &Sample, b2: f32) -> (f32, bool, bool) {
+        let variance = self.floor + self.gain * s.background;
+        let fits = s.rest <= self.noise_limit * variance + self.harmonic_limit * b2;
+        (variance, s.top < self.saturation, fits)
+    }
 
-/// The body of [`fuse`], and its fallback.
-#[inline(always)]
-fn plain_fuse(fit: &Sinusoid, judge: &Judge, first: bool, why: &mut Lane, out: &mut Fused) {
-    for i in 0..TILE {
-        let (re, im, background) = (fit.re[i], fit.im[i], fit.background[i]);
-        let b2 = re * re + im * im;
-        let b = b2.sqrt();
-        let variance = judge.floor + judge.gain * background;
-        let clear = fit.top[i] < judge.saturation;
-        let fits = fit.rest[i] <= judge.noise_limit * variance + judge.harmonic_limit * b2;
-        let ok = clear & fits;
-        let gain = if ok { b / variance } else { 0.0 };
-        let weight = judge.half * b * gain;
-        let before = if first {
-            [0.0; 6]
-        } else {
-            [out.re[i], out.im[i], out.weight[i], out.best[i], out.background[i], out.modulation[i]]
-        };
-        let better = first | (weight > before[3]);
-        out.re[i] = before[0] + re * gain;
-        out.im[i] = before[1] + im * gain;
-        out.weight[i] = before[2] + weight;
-        out.best[i] = if better { weight } else { before[3] };
-        out.background[i] = if better { background } else { before[4] };
-        out.modulation[i] = if better { b } else { before[5] };
-        // Remembered only where nothing else is usable: see `finish`.
-        why[i] =
-            if clear { if fits { why[i] } else { Reason::NoFit as u8 as f32 } } else { Reason::Saturated as u8 as f32 };
+    /// The reason that a set without an answer has: nothing usable, by what was seen, or a modulation that does not
+    /// stand z sigma above the noise.
+    #[inline(always)]
+    fn reason(&self, weight: f32, unfit: f32) -> f32 {
+        let dark = if weight < self.z * self.z { Reason::Dark as u8 as f32 } else { 0.0 };
+        if (weight <= 0.0) & (unfit > 0.0) { unfit } else { dark }
     }
 }
 
-/// Turns the summed phasors of a set into a phase, and keeps the reason where there is none.
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
-fn finish(z: f32, why_set: &Lane, set: &mut Fused, why: &mut Lane) {
-    plain_finish(z, why_set, set, why);
+#[inline(always)]
+fn unfit(clear: bool, fits: bool, before: f32) -> f32 {
+    let unfit = if fits { before } else { Reason::NoFit as u8 as f32 };
+    if clear { unfit } else { Reason::Saturated as u8 as f32 }
 }
 
-/// The body of [`finish`], and its fallback.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+pub(super) fn fuse_alone_u8(frames: &[&[u8; TILE]], wave: &Wave, judge: &Judge, set: &mut Fused, why: &mut Lane) {
+    plain_fuse_alone(frames, wave, judge, set, why);
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+pub(super) fn fuse_alone_u16(frames: &[&[u16; TILE]], wave: &Wave, judge: &Judge, set: &mut Fused, why: &mut Lane) {
+    plain_fuse_alone(frames, wave, judge, set, why);
+}
+
+/// A set of the only exposure: from grey levels to phase in one go. The body of both, and their fallback.
 #[inline(always)]
-fn plain_finish(z: f32, why_set: &Lane, set: &mut Fused, why: &mut Lane) {
-    let least = z * z;
-    for i in 0..TILE {
-        let weight = set.weight[i];
-        set.phase[i] = turns(set.im[i], set.re[i]);
-        set.variance[i] = 1.0 / (weight + 1e-30);
-        // Nothing usable: saturated or no fit. Otherwise the modulation has to stand z sigma above the noise.
-        let unusable = (weight <= 0.0) & (why_set[i] > 0.0);
-        let dark = if weight < least { Reason::Dark as u8 as f32 } else { 0.0 };
-        let here = if unusable { why_set[i] } else { dark };
+fn plain_fuse_alone<T: Level>(frames: &[&[T; TILE]], wave: &Wave, judge: &Judge, set: &mut Fused, why: &mut Lane) {
+    each_pixel(frames, wave, &mut Alone { judge, set, why });
+}
+
+struct Alone<'a> {
+    judge: &'a Judge,
+    set: &'a mut Fused,
+    why: &'a mut Lane,
+}
+
+impl Take for Alone<'_> {
+    #[inline(always)]
+    fn take(&mut self, i: usize, s: Sample) {
+        let Self { judge, set, why } = self;
+        let b2 = s.re * s.re + s.im * s.im;
+        let (variance, clear, fits) = judge.look(&s, b2);
+        let power = judge.half * b2;
+        let power = if power > 1e-12 { power } else { 1e-12 };
+        // Three quotients by one division.
+        let (above, below) = turns_quotient(s.im, s.re);
+        let per_all = 1.0 / (variance * below * power);
+        let ok = clear & fits;
+        let weight = if ok { power * (below * power * per_all) } else { 0.0 };
+        set.phase[i] = turns_of(above * (variance * power * per_all), s.im, s.re);
+        set.weight[i] = weight;
+        set.variance[i] = if ok { variance * (variance * below * per_all) } else { 1e30 };
+        set.background[i] = s.background;
+        set.modulation2[i] = b2;
+        let here = judge.reason(weight, unfit(clear, fits, 0.0));
         why[i] = if why[i] > 0.0 { why[i] } else { here };
+    }
+}
+
+/// Adds one of several exposures to a set. The last one turns the sum of the phasors into a phase.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+fn fuse(fit: &Sinusoid, judge: &Judge, first: bool, last: bool, set: &mut Fused, why: &mut Lane) {
+    plain_fuse(fit, judge, first, last, set, why);
+}
+
+/// The body of [`fuse`], and its fallback: a loop for each place that an exposure may have.
+#[inline(always)]
+fn plain_fuse(fit: &Sinusoid, judge: &Judge, first: bool, last: bool, set: &mut Fused, why: &mut Lane) {
+    match (first, last) {
+        (true, _) => fuse_loop::<true, false>(fit, judge, set, why),
+        (false, true) => fuse_loop::<false, true>(fit, judge, set, why),
+        (false, false) => fuse_loop::<false, false>(fit, judge, set, why),
+    }
+}
+
+#[inline(always)]
+fn fuse_loop<const FIRST: bool, const LAST: bool>(fit: &Sinusoid, judge: &Judge, set: &mut Fused, why: &mut Lane) {
+    for i in 0..TILE {
+        let s = fit.at(i);
+        let b2 = s.re * s.re + s.im * s.im;
+        let b = b2.sqrt();
+        let (variance, clear, fits) = judge.look(&s, b2);
+        let gain = if clear & fits { b / variance } else { 0.0 };
+        let weight = judge.half * b * gain;
+        let [re, im, sum, best, before] =
+            if FIRST { [0.0; 5] } else { [set.re[i], set.im[i], set.weight[i], set.best[i], set.why[i]] };
+        let better = FIRST | (weight > best);
+        let (re, im, sum) = (re + s.re * gain, im + s.im * gain, sum + weight);
+        set.weight[i] = sum;
+        set.background[i] = if better { s.background } else { set.background[i] };
+        set.modulation2[i] = if better { b2 } else { set.modulation2[i] };
+        // Kept in mind only in case nothing else is usable.
+        let unfit = unfit(clear, fits, before);
+        if LAST {
+            set.phase[i] = turns(im, re);
+            set.variance[i] = 1.0 / (sum + 1e-30);
+            let here = judge.reason(sum, unfit);
+            why[i] = if why[i] > 0.0 { why[i] } else { here };
+        } else {
+            (set.re[i], set.im[i], set.why[i]) = (re, im, unfit);
+            set.best[i] = if better { weight } else { best };
+        }
     }
 }
 
@@ -198,13 +270,14 @@ fn combine(weights: &[f32], sets: &[Fused], out: &mut Lane) {
 /// Judges one decision on a fringe order by its noise (in fringes) and by how well the frequencies agreed.
 #[inline(always)]
 fn judge_order(z: f32, variance: &Lane, miss: &Lane, why: &mut Lane) {
-    // sigma is in radians, the miss in fringes.
-    let to_fringes = z / (TAU as f32);
+    // sigma is in radians, the miss in fringes; squares spare the root.
+    let to_fringes2 = (z / TAU as f32).powi(2);
+    let model2 = MODEL_ERROR_FRINGES.powi(2);
     for i in 0..TILE {
-        let noise = to_fringes * variance[i].sqrt();
-        let dark = if noise >= 0.5 { Reason::Dark as u8 as f32 } else { 0.0 };
-        let limit = if noise > MODEL_ERROR_FRINGES { noise } else { MODEL_ERROR_FRINGES };
-        let doubt = if miss[i].abs() > limit { Reason::OrderInDoubt as u8 as f32 } else { 0.0 };
+        let noise2 = to_fringes2 * variance[i];
+        let dark = if noise2 >= 0.25 { Reason::Dark as u8 as f32 } else { 0.0 };
+        let limit2 = if noise2 > model2 { noise2 } else { model2 };
+        let doubt = if miss[i] * miss[i] > limit2 { Reason::OrderInDoubt as u8 as f32 } else { 0.0 };
         let here = if dark > 0.0 { dark } else { doubt };
         why[i] = if why[i] > 0.0 { why[i] } else { here };
     }
@@ -252,7 +325,7 @@ fn plain_unwrap(chain: &Chain, work: &mut Work) {
         judge_order(chain.z, &variance, &miss, &mut work.why);
     }
     // The finest set, averaged with those that are nearly as fine, by information: weight times frequency squared.
-    let (mut correction, mut information) = ([0.0f32; TILE], finest.weight);
+    let (mut correction, mut information, mut uncertainty) = ([0.0f32; TILE], finest.weight, finest.variance);
     for &(set, ratio) in &chain.helpers {
         let Some(set) = sets.get(set) else { continue };
         let inverse = 1.0 / ratio;
@@ -266,26 +339,33 @@ fn plain_unwrap(chain: &Chain, work: &mut Work) {
         }
         judge_order(chain.z, &variance, &miss, &mut work.why);
     }
-    let spread = chain.pixels / TAU;
+    if !chain.helpers.is_empty() {
+        for i in 0..TILE {
+            uncertainty[i] = 1.0 / (information[i] + 1e-30);
+            correction[i] *= uncertainty[i];
+        }
+    }
+    let spread = (chain.pixels / TAU) as f32;
+    // Within the noise of the border the other border is as likely.
+    let (low, high) = (-0.5f32, (chain.size - 0.5) as f32);
     for i in 0..TILE {
-        let phase = f64::from(finest.phase[i]) + f64::from(correction[i] / (information[i] + 1e-30));
+        let phase = f64::from(finest.phase[i]) + f64::from(correction[i]);
         let column = (f64::from(order[i]) + phase) * chain.pixels - 0.5;
         let wrap = if column < -0.5 { chain.size } else { 0.0 };
         let wrap = if column >= chain.size - 0.5 { -chain.size } else { wrap };
         let column = if chain.cyclic { column + wrap } else { column };
-        let sigma = spread / f64::from(information[i] + 1e-30).sqrt();
-        // Within the noise of the border the other border is as likely.
-        let margin = f64::from(chain.z) * sigma - 0.5;
-        let outside = (column < margin) | (column > chain.size - 1.0 - margin);
+        let sigma = spread * uncertainty[i].sqrt();
+        let margin = chain.z * sigma;
+        let outside = ((column as f32) < low + margin) | (column as f32 > high - margin);
         let doubt = if outside { Reason::OrderInDoubt as u8 as f32 } else { 0.0 };
         let why = if work.why[i] > 0.0 { work.why[i] } else { doubt };
         work.column[i] = if why > 0.0 { f64::NAN } else { column };
-        work.sigma[i] = if why > 0.0 { f32::NAN } else { sigma as f32 };
+        work.sigma[i] = if why > 0.0 { f32::NAN } else { sigma };
         // A small whole number in the lowest bits: a conversion would be made one by one.
         work.reason[i] = (why + 8_388_608.0).to_bits() as u8;
+        work.modulation[i] = finest.modulation2[i].sqrt();
+        work.background[i] = finest.background[i];
     }
-    work.modulation = finest.modulation;
-    work.background = finest.background;
 }
 
 pub(super) struct Decoder<'a, T> {
@@ -319,6 +399,7 @@ impl<'a, T: Level> Decoder<'a, T> {
                 gain: noise.gain as f32,
                 saturation,
                 half: 0.5 * n as f32,
+                z,
                 noise_limit,
                 harmonic_limit: (n * HARMONIC_LIMIT.powi(2)) as f32,
             };
@@ -357,13 +438,16 @@ impl<'a, T: Level> Decoder<'a, T> {
         work.why = [0.0; TILE];
         for (i, (at, steps, wave, judge)) in self.sets.iter().enumerate() {
             let Some(set) = work.sets.get_mut(i) else { continue };
-            let mut why_set = [0.0; TILE];
+            let last = self.shot.exposures.len() - 1;
             for (e, frames) in self.shot.exposures.iter().enumerate() {
                 let frames = frames.get(*at..at + steps).unwrap_or_default();
-                demodulate(frames, start, len, wave, &mut work.fit);
-                fuse(&work.fit, judge, e == 0, &mut why_set, set);
+                if last == 0 {
+                    tile_of(frames, start, len, |tiles| T::fuse_alone(tiles, wave, judge, set, &mut work.why));
+                } else {
+                    demodulate(frames, start, len, wave, &mut work.fit);
+                    fuse(&work.fit, judge, e == 0, e == last, set, &mut work.why);
+                }
             }
-            finish(self.chain.z, &why_set, set, &mut work.why);
             if let Some(Some((steps, terms))) = self.errors.get(i) {
                 response::compensate(*steps, terms, &mut set.phase);
             }
@@ -387,24 +471,31 @@ mod tests {
     fn vectors_and_the_plain_fallback_give_the_same_bits() {
         let frames = images(2 * TILE, 1);
         let frames: Vec<&[u8]> = frames.iter().map(Vec::as_slice).collect();
-        let shot = Shot { exposures: vec![frames.clone(), frames], width: 2 * TILE, height: 1 };
+        for exposures in [vec![frames.clone()], vec![frames.clone(), frames.clone()]] {
+            compare_with_plain(&Shot { exposures, width: 2 * TILE, height: 1 });
+        }
+    }
+
+    fn compare_with_plain(shot: &Shot<'_, u8>) {
         let plan = Plan::new(&SETS.map(|s| s.periods), 5.0).unwrap();
         let model = Noise { read_variance: 0.5, gain: 0.01, source: NoiseSource::Assumed };
-        let decoder = Decoder::new(&shot, &SETS, &plan, 912, model, 255.0, 5.0);
+        let decoder = Decoder::new(shot, &SETS, &plan, 912, model, 255.0, 5.0);
         for start in [0, TILE] {
             let mut fast = Work::new(SETS.len());
             decoder.tile(start, TILE, &mut fast);
 
             let mut plain = Work::new(SETS.len());
             for (i, (at, steps, wave, judge)) in decoder.sets.iter().enumerate() {
-                let mut why_set = [0.0; TILE];
                 for (e, frames) in shot.exposures.iter().enumerate() {
                     let tiles: Vec<&[u8; TILE]> =
                         frames[*at..at + steps].iter().map(|f| f[start..start + TILE].try_into().unwrap()).collect();
-                    wave::demodulate(&tiles, wave, &mut plain.fit);
-                    plain_fuse(&plain.fit, judge, e == 0, &mut why_set, &mut plain.sets[i]);
+                    if shot.exposures.len() == 1 {
+                        plain_fuse_alone(&tiles, wave, judge, &mut plain.sets[i], &mut plain.why);
+                    } else {
+                        wave::demodulate(&tiles, wave, &mut plain.fit);
+                        plain_fuse(&plain.fit, judge, e == 0, e == 1, &mut plain.sets[i], &mut plain.why);
+                    }
                 }
-                plain_finish(5.0, &why_set, &mut plain.sets[i], &mut plain.why);
             }
             plain_unwrap(&decoder.chain, &mut plain);
             let columns = |w: &Work| w.column.map(f64::to_bits).to_vec();

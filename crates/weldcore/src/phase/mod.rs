@@ -26,7 +26,7 @@ pub(crate) use wave::{round, round64};
 pub use wrapped::{WrappedPhase, decode_phase};
 
 use crate::error::{Error, Result, require_positive};
-use crate::memory::zeros;
+use crate::memory::{fill, filled, room};
 use crate::threads::{self, CHUNK};
 use crate::unwrap::Plan;
 use jumps::reject_jumps;
@@ -179,14 +179,38 @@ pub fn decode_shot<T: Level>(
         .compensating(&phase_error);
 
     let n = shot.width * shot.height;
+    let (mut column, mut sigma, mut reason) = (room::<f64>(n), room::<f32>(n), room::<u8>(n));
+    let (mut modulation, mut background) = (room::<f32>(n), room::<f32>(n));
+    threads::install(|| {
+        let floats = sigma.par_chunks_mut(CHUNK).zip(modulation.par_chunks_mut(CHUNK));
+        let floats = floats.zip(background.par_chunks_mut(CHUNK));
+        let columns = column.par_chunks_mut(CHUNK).zip(reason.par_chunks_mut(CHUNK));
+        columns.zip(floats).enumerate().for_each(|(chunk, ((column, reason), ((sigma, modulation), background)))| {
+            let mut work = Work::new(sets.len());
+            let tiles = column.chunks_mut(TILE).zip(reason.chunks_mut(TILE));
+            let floats = sigma.chunks_mut(TILE).zip(modulation.chunks_mut(TILE)).zip(background.chunks_mut(TILE));
+            for (tile, ((column, reason), ((sigma, modulation), background))) in tiles.zip(floats).enumerate() {
+                decoder.tile(chunk * CHUNK + tile * TILE, column.len(), &mut work);
+                fill(column, &work.column);
+                fill(reason, &work.reason);
+                fill(sigma, &work.sigma);
+                fill(modulation, &work.modulation);
+                fill(background, &work.background);
+            }
+        });
+    });
+    // SAFETY: the chunks cover the images, and their tiles, of at most `TILE` pixels, the chunks.
+    let (column_px, sigma_px, reason) = unsafe { (filled(column), filled(sigma), filled(reason)) };
+    // SAFETY: as above.
+    let (modulation, background) = unsafe { (filled(modulation), filled(background)) };
     let mut map = PhaseMap {
         width: shot.width,
         height: shot.height,
-        column_px: zeros(n),
-        sigma_px: zeros(n),
-        modulation: zeros(n),
-        background: zeros(n),
-        reason: zeros(n),
+        column_px,
+        sigma_px,
+        modulation,
+        background,
+        reason,
         counts: [0; REASONS],
         noise,
         saturation,
@@ -194,24 +218,6 @@ pub fn decode_shot<T: Level>(
         phase_error,
         plan: plan.clone(),
     };
-    threads::install(|| {
-        let floats = map.sigma_px.par_chunks_mut(CHUNK).zip(map.modulation.par_chunks_mut(CHUNK));
-        let floats = floats.zip(map.background.par_chunks_mut(CHUNK));
-        let columns = map.column_px.par_chunks_mut(CHUNK).zip(map.reason.par_chunks_mut(CHUNK));
-        columns.zip(floats).enumerate().for_each(|(chunk, ((column, reason), ((sigma, modulation), background)))| {
-            let mut work = Work::new(sets.len());
-            let tiles = column.chunks_mut(TILE).zip(reason.chunks_mut(TILE));
-            let floats = sigma.chunks_mut(TILE).zip(modulation.chunks_mut(TILE)).zip(background.chunks_mut(TILE));
-            for (tile, ((column, reason), ((sigma, modulation), background))) in tiles.zip(floats).enumerate() {
-                decoder.tile(chunk * CHUNK + tile * TILE, column.len(), &mut work);
-                column.copy_from_slice(&work.column[..column.len()]);
-                reason.copy_from_slice(&work.reason[..reason.len()]);
-                sigma.copy_from_slice(&work.sigma[..sigma.len()]);
-                modulation.copy_from_slice(&work.modulation[..modulation.len()]);
-                background.copy_from_slice(&work.background[..background.len()]);
-            }
-        });
-    });
     if !plan.links.is_empty() {
         let finest = sets.get(plan.finest).map_or(1.0, |s| s.periods);
         reject_jumps(&mut map, 0.5 * projector_size as f64 / finest);

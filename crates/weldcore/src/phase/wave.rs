@@ -8,11 +8,13 @@ use std::f64::consts::TAU;
 
 use multiversion::multiversion;
 
+use super::kernel::{self, Fused, Judge};
+
 /// Pixels that a kernel takes at a time: all of its arrays stay in the first-level cache.
 pub(crate) const TILE: usize = 256;
 
 /// One number per pixel of a tile.
-pub(crate) type Lane = [f32; TILE];
+pub type Lane = [f32; TILE];
 
 /// A grey level as cameras deliver it.
 pub trait Level: Copy + Send + Sync + Default + Into<f32> + Into<f64> + Into<u32> + 'static {
@@ -20,6 +22,8 @@ pub trait Level: Copy + Send + Sync + Default + Into<f32> + Into<f64> + Into<u32
     const FULL: u32;
     #[doc(hidden)]
     fn demodulate(frames: &[&[Self; TILE]], wave: &Wave, out: &mut Sinusoid);
+    #[doc(hidden)]
+    fn fuse_alone(frames: &[&[Self; TILE]], wave: &Wave, judge: &Judge, set: &mut Fused, why: &mut Lane);
 }
 
 impl Level for u8 {
@@ -27,12 +31,18 @@ impl Level for u8 {
     fn demodulate(frames: &[&[Self; TILE]], wave: &Wave, out: &mut Sinusoid) {
         demodulate_u8(frames, wave, out);
     }
+    fn fuse_alone(frames: &[&[Self; TILE]], wave: &Wave, judge: &Judge, set: &mut Fused, why: &mut Lane) {
+        kernel::fuse_alone_u8(frames, wave, judge, set, why);
+    }
 }
 
 impl Level for u16 {
     const FULL: u32 = 65_535;
     fn demodulate(frames: &[&[Self; TILE]], wave: &Wave, out: &mut Sinusoid) {
         demodulate_u16(frames, wave, out);
+    }
+    fn fuse_alone(frames: &[&[Self; TILE]], wave: &Wave, judge: &Judge, set: &mut Fused, why: &mut Lane) {
+        kernel::fuse_alone_u16(frames, wave, judge, set, why);
     }
 }
 
@@ -73,10 +83,38 @@ pub struct Sinusoid {
     pub top: Lane,
 }
 
+/// The same of one pixel.
+pub(crate) struct Sample {
+    pub re: f32,
+    pub im: f32,
+    pub background: f32,
+    pub rest: f32,
+    pub top: f32,
+}
+
+/// What is done with the sinusoid of each pixel. A trait, for closures cannot be told to be inlined, and outside of the
+/// caller's loop they would not become vectors.
+pub(crate) trait Take {
+    fn take(&mut self, i: usize, sample: Sample);
+}
+
+impl Take for Sinusoid {
+    #[inline(always)]
+    fn take(&mut self, i: usize, s: Sample) {
+        (self.re[i], self.im[i], self.background[i]) = (s.re, s.im, s.background);
+        (self.rest[i], self.top[i]) = (s.rest, s.top);
+    }
+}
+
 impl Sinusoid {
     pub(crate) fn empty() -> Self {
         let zero = [0.0; TILE];
         Self { re: zero, im: zero, background: zero, rest: zero, top: zero }
+    }
+
+    #[inline(always)]
+    pub(crate) fn at(&self, i: usize) -> Sample {
+        Sample { re: self.re[i], im: self.im[i], background: self.background[i], rest: self.rest[i], top: self.top[i] }
     }
 }
 
@@ -90,21 +128,33 @@ fn demodulate_u16(frames: &[&[u16; TILE]], wave: &Wave, out: &mut Sinusoid) {
     demodulate(frames, wave, out);
 }
 
-/// The usual numbers of steps keep all samples of a pixel in registers; the rest go frame by frame.
 #[inline(always)]
 pub(crate) fn demodulate<T: Level>(frames: &[&[T; TILE]], wave: &Wave, out: &mut Sinusoid) {
+    each_pixel(frames, wave, out);
+}
+
+/// Hands the sinusoid of every pixel to `to`. The usual numbers of steps keep all samples of a pixel in registers; the
+/// rest go frame by frame.
+#[inline(always)]
+pub(crate) fn each_pixel<T: Level>(frames: &[&[T; TILE]], wave: &Wave, to: &mut impl Take) {
     match frames.len() {
-        3 => demodulate_fixed::<T, 3>(frames, wave, out),
-        4 => demodulate_four(frames, out),
-        5 => demodulate_fixed::<T, 5>(frames, wave, out),
-        6 => demodulate_fixed::<T, 6>(frames, wave, out),
-        8 => demodulate_fixed::<T, 8>(frames, wave, out),
-        _ => demodulate_any(frames, wave, out),
+        3 => each_fixed::<T, 3>(frames, wave, to),
+        4 => each_of_four(frames, to),
+        5 => each_fixed::<T, 5>(frames, wave, to),
+        6 => each_fixed::<T, 6>(frames, wave, to),
+        8 => each_fixed::<T, 8>(frames, wave, to),
+        _ => {
+            let mut fit = Sinusoid::empty();
+            demodulate_any(frames, wave, &mut fit);
+            for i in 0..TILE {
+                to.take(i, fit.at(i));
+            }
+        }
     }
 }
 
 #[inline(always)]
-fn demodulate_fixed<T: Level, const N: usize>(frames: &[&[T; TILE]], wave: &Wave, out: &mut Sinusoid) {
+fn each_fixed<T: Level, const N: usize>(frames: &[&[T; TILE]], wave: &Wave, to: &mut impl Take) {
     let (Ok(frames), Ok(cos), Ok(sin)) = (
         <&[&[T; TILE]; N]>::try_from(frames),
         <&[f32; N]>::try_from(wave.cos32.as_slice()),
@@ -131,27 +181,26 @@ fn demodulate_fixed<T: Level, const N: usize>(frames: &[&[T; TILE]], wave: &Wave
                 rest += miss * miss;
             }
         }
-        out.re[i] = re;
-        out.im[i] = im;
-        out.background[i] = background;
-        out.rest[i] = rest;
-        out.top[i] = top;
+        to.take(i, Sample { re, im, background, rest, top });
     }
 }
 
 /// Four steps: cos and sin are 0 and ±1, and the residual is what alternates.
 #[inline(always)]
-fn demodulate_four<T: Level>(frames: &[&[T; TILE]], out: &mut Sinusoid) {
+fn each_of_four<T: Level>(frames: &[&[T; TILE]], to: &mut impl Take) {
     let &[a, b, c, d] = frames else { return };
     for i in 0..TILE {
         let (a, b, c, d): (f32, f32, f32, f32) = (a[i].into(), b[i].into(), c[i].into(), d[i].into());
         let higher = |x: f32, y: f32| if x > y { x } else { y };
         let alternating = (a + c) - (b + d);
-        out.re[i] = 0.5 * (a - c);
-        out.im[i] = 0.5 * (b - d);
-        out.background[i] = 0.25 * ((a + c) + (b + d));
-        out.rest[i] = 0.25 * (alternating * alternating);
-        out.top[i] = higher(higher(a, b), higher(c, d));
+        let sample = Sample {
+            re: 0.5 * (a - c),
+            im: 0.5 * (b - d),
+            background: 0.25 * ((a + c) + (b + d)),
+            rest: 0.25 * (alternating * alternating),
+            top: higher(higher(a, b), higher(c, d)),
+        };
+        to.take(i, sample);
     }
 }
 
@@ -186,12 +235,26 @@ fn demodulate_any<T: Level>(frames: &[&[T; TILE]], wave: &Wave, out: &mut Sinuso
 /// where that lies beyond tan 22.5°, then an odd polynomial through Chebyshev points.
 #[inline(always)]
 pub(crate) fn turns(y: f32, x: f32) -> f32 {
+    let (above, below) = turns_quotient(y, x);
+    turns_of(above / below, y, x)
+}
+
+/// The quotient that [`turns_of`] wants, not yet divided; the divisor is 1e-6 at least.
+#[inline(always)]
+pub(crate) fn turns_quotient(y: f32, x: f32) -> (f32, f32) {
     let (ax, ay) = (x.abs(), y.abs());
     let (large, small) = if ax > ay { (ax, ay) } else { (ay, ax) };
     let far = small > 0.414_213_57 * large;
     let above = if far { small - large } else { small };
     let below = if far { small + large } else { large };
-    let q = above / (if below > 0.0 { below } else { 1.0 });
+    (above, if below > 1e-6 { below } else { 1e-6 })
+}
+
+#[inline(always)]
+pub(crate) fn turns_of(q: f32, y: f32, x: f32) -> f32 {
+    let (ax, ay) = (x.abs(), y.abs());
+    let (large, small) = if ax > ay { (ax, ay) } else { (ay, ax) };
+    let far = small > 0.414_213_57 * large;
     let z = q * q;
     let p = 3.178_972_8e-2 + z * (-2.204_043_7e-2 + z * 1.269_426_5e-2);
     let p = q * (0.159_154_94 + z * (-5.305_077_6e-2 + z * p));

@@ -23,7 +23,11 @@ mod transform;
 mod triangulate;
 
 use crate::error::Error;
+use crate::memory::Recycler;
 use crate::transform::Transform;
+
+#[global_allocator]
+static ALLOCATOR: Recycler = Recycler;
 
 /// Turns a core error into the exception of the same kind from `weldscan.errors`.
 pub(crate) fn raise(py: Python<'_>, error: &Error) -> PyErr {

@@ -3,6 +3,7 @@
 //! As in [`super::wave`] each loop is compiled for several instruction sets, and all of them give the same bits.
 
 use std::f64::consts::TAU;
+use std::mem::MaybeUninit;
 
 use multiversion::multiversion;
 
@@ -67,11 +68,15 @@ pub(super) struct Work {
     sets: Vec<Fused>,
     /// Reason so far, as a number, so that the loops stay vectors.
     why: Lane,
-    pub(super) column: [f64; TILE],
-    pub(super) sigma: Lane,
-    pub(super) modulation: Lane,
-    pub(super) background: Lane,
-    pub(super) reason: [u8; TILE],
+}
+
+/// The results of a tile: parts of the result's arrays, of one length of `TILE` at most.
+pub(super) struct Results<'a> {
+    pub(super) column: &'a mut [MaybeUninit<f64>],
+    pub(super) sigma: &'a mut [MaybeUninit<f32>],
+    pub(super) modulation: &'a mut [MaybeUninit<f32>],
+    pub(super) background: &'a mut [MaybeUninit<f32>],
+    pub(super) reason: &'a mut [MaybeUninit<u8>],
 }
 
 impl Work {
@@ -88,16 +93,7 @@ impl Work {
             phase: zero,
             variance: zero,
         };
-        Self {
-            fit: Sinusoid::empty(),
-            sets: (0..sets).map(|_| fused()).collect(),
-            why: zero,
-            column: [0.0; TILE],
-            sigma: zero,
-            modulation: zero,
-            background: zero,
-            reason: [0; TILE],
-        }
+        Self { fit: Sinusoid::empty(), sets: (0..sets).map(|_| fused()).collect(), why: zero }
     }
 }
 
@@ -284,15 +280,16 @@ fn judge_order(z: f32, variance: &Lane, miss: &Lane, why: &mut Lane) {
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
-fn unwrap(chain: &Chain, work: &mut Work) {
-    plain_unwrap(chain, work);
+fn unwrap(chain: &Chain, work: &mut Work, out: &mut Results) {
+    plain_unwrap(chain, work, out);
 }
 
 /// The body of [`unwrap`], and its fallback.
 #[inline(always)]
-fn plain_unwrap(chain: &Chain, work: &mut Work) {
+fn plain_unwrap(chain: &Chain, work: &mut Work, out: &mut Results) {
     let sets = &work.sets;
-    let Some(finest) = sets.get(chain.finest) else { return };
+    // A plan has its finest set.
+    let finest = &sets[chain.finest];
     let (mut absolute, mut signal, mut variance, mut miss) = ([0.0; TILE], [0.0; TILE], [0.0; TILE], [0.0; TILE]);
     combine(&chain.base, sets, &mut absolute);
     for value in &mut absolute {
@@ -348,7 +345,10 @@ fn plain_unwrap(chain: &Chain, work: &mut Work) {
     let spread = (chain.pixels / TAU) as f32;
     // Within the noise of the border the other border is as likely.
     let (low, high) = (-0.5f32, (chain.size - 0.5) as f32);
-    for i in 0..TILE {
+    let n = out.column.len().min(TILE);
+    let (columns, sigmas, reasons) = (&mut out.column[..n], &mut out.sigma[..n], &mut out.reason[..n]);
+    let (modulations, backgrounds) = (&mut out.modulation[..n], &mut out.background[..n]);
+    for i in 0..n {
         let phase = f64::from(finest.phase[i]) + f64::from(correction[i]);
         let column = (f64::from(order[i]) + phase) * chain.pixels - 0.5;
         let wrap = if column < -0.5 { chain.size } else { 0.0 };
@@ -359,12 +359,12 @@ fn plain_unwrap(chain: &Chain, work: &mut Work) {
         let outside = ((column as f32) < low + margin) | (column as f32 > high - margin);
         let doubt = if outside { Reason::OrderInDoubt as u8 as f32 } else { 0.0 };
         let why = if work.why[i] > 0.0 { work.why[i] } else { doubt };
-        work.column[i] = if why > 0.0 { f64::NAN } else { column };
-        work.sigma[i] = if why > 0.0 { f32::NAN } else { sigma };
+        columns[i] = MaybeUninit::new(if why > 0.0 { f64::NAN } else { column });
+        sigmas[i] = MaybeUninit::new(if why > 0.0 { f32::NAN } else { sigma });
         // A small whole number in the lowest bits: a conversion would be made one by one.
-        work.reason[i] = (why + 8_388_608.0).to_bits() as u8;
-        work.modulation[i] = finest.modulation2[i].sqrt();
-        work.background[i] = finest.background[i];
+        reasons[i] = MaybeUninit::new((why + 8_388_608.0).to_bits() as u8);
+        modulations[i] = MaybeUninit::new(finest.modulation2[i].sqrt());
+        backgrounds[i] = MaybeUninit::new(finest.background[i]);
     }
 }
 
@@ -434,7 +434,9 @@ impl<'a, T: Level> Decoder<'a, T> {
         self
     }
 
-    pub(super) fn tile(&self, start: usize, len: usize, work: &mut Work) {
+    /// Writes every pixel of the results, which begin at pixel `start`.
+    pub(super) fn tile(&self, start: usize, work: &mut Work, mut out: Results) {
+        let len = out.column.len();
         work.why = [0.0; TILE];
         for (i, (at, steps, wave, judge)) in self.sets.iter().enumerate() {
             let Some(set) = work.sets.get_mut(i) else { continue };
@@ -452,7 +454,7 @@ impl<'a, T: Level> Decoder<'a, T> {
                 response::compensate(*steps, terms, &mut set.phase);
             }
         }
-        unwrap(&self.chain, work);
+        unwrap(&self.chain, work, &mut out);
     }
 }
 
@@ -463,8 +465,20 @@ mod tests {
     use super::super::wave;
     use super::*;
 
-    fn bits(lane: &Lane) -> Vec<u32> {
-        lane.iter().map(|v| v.to_bits()).collect()
+    /// Bits of column, sigma, modulation and background, and the reasons.
+    type Bits = (Vec<u64>, [Vec<u32>; 3], Vec<u8>);
+
+    fn results(job: impl FnOnce(Results)) -> Bits {
+        let (mut column, mut reason) = ([MaybeUninit::new(0f64); TILE], [MaybeUninit::new(0u8); TILE]);
+        let mut floats = [[MaybeUninit::new(0f32); TILE]; 3];
+        let [sigma, modulation, background] = &mut floats;
+        job(Results { column: &mut column, sigma, modulation, background, reason: &mut reason });
+        // SAFETY: all were initialised above.
+        let bits = |lane: [MaybeUninit<f32>; TILE]| lane.map(|v| unsafe { v.assume_init() }.to_bits()).to_vec();
+        // SAFETY: as above.
+        let column = column.map(|v| unsafe { v.assume_init() }.to_bits()).to_vec();
+        // SAFETY: as above.
+        (column, floats.map(bits), reason.map(|v| unsafe { v.assume_init() }).to_vec())
     }
 
     #[test]
@@ -481,8 +495,8 @@ mod tests {
         let model = Noise { read_variance: 0.5, gain: 0.01, source: NoiseSource::Assumed };
         let decoder = Decoder::new(shot, &SETS, &plan, 912, model, 255.0, 5.0);
         for start in [0, TILE] {
-            let mut fast = Work::new(SETS.len());
-            decoder.tile(start, TILE, &mut fast);
+            let mut work = Work::new(SETS.len());
+            let fast = results(|out| decoder.tile(start, &mut work, out));
 
             let mut plain = Work::new(SETS.len());
             for (i, (at, steps, wave, judge)) in decoder.sets.iter().enumerate() {
@@ -497,14 +511,9 @@ mod tests {
                     }
                 }
             }
-            plain_unwrap(&decoder.chain, &mut plain);
-            let columns = |w: &Work| w.column.map(f64::to_bits).to_vec();
-            assert_eq!(columns(&fast), columns(&plain));
-            assert_eq!(bits(&fast.sigma), bits(&plain.sigma));
-            assert_eq!(bits(&fast.modulation), bits(&plain.modulation));
-            assert_eq!(bits(&fast.background), bits(&plain.background));
-            assert_eq!(fast.reason, plain.reason);
-            assert!(start == 0 || fast.reason.contains(&0));
+            let plain = results(|mut out| plain_unwrap(&decoder.chain, &mut plain, &mut out));
+            assert_eq!(fast, plain);
+            assert!(start == 0 || fast.2.contains(&0));
         }
     }
 }

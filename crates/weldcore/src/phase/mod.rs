@@ -26,11 +26,11 @@ pub(crate) use wave::{round, round64};
 pub use wrapped::{WrappedPhase, decode_phase};
 
 use crate::error::{Error, Result, require_positive};
-use crate::memory::{fill, filled, room};
+use crate::memory::{filled, room};
 use crate::threads::{self, CHUNK};
 use crate::unwrap::Plan;
 use jumps::reject_jumps;
-use kernel::{Decoder, Work, demodulate};
+use kernel::{Decoder, Results, Work, demodulate};
 use wave::{Sinusoid, TILE, Wave};
 
 /// N steps of one frequency.
@@ -190,16 +190,12 @@ pub fn decode_shot<T: Level>(
             let tiles = column.chunks_mut(TILE).zip(reason.chunks_mut(TILE));
             let floats = sigma.chunks_mut(TILE).zip(modulation.chunks_mut(TILE)).zip(background.chunks_mut(TILE));
             for (tile, ((column, reason), ((sigma, modulation), background))) in tiles.zip(floats).enumerate() {
-                decoder.tile(chunk * CHUNK + tile * TILE, column.len(), &mut work);
-                fill(column, &work.column);
-                fill(reason, &work.reason);
-                fill(sigma, &work.sigma);
-                fill(modulation, &work.modulation);
-                fill(background, &work.background);
+                let results = Results { column, sigma, modulation, background, reason };
+                decoder.tile(chunk * CHUNK + tile * TILE, &mut work, results);
             }
         });
     });
-    // SAFETY: the chunks cover the images, and their tiles, of at most `TILE` pixels, the chunks.
+    // SAFETY: the chunks cover the images, and their tiles, of at most `TILE` pixels, the chunks; a tile writes them all.
     let (column_px, sigma_px, reason) = unsafe { (filled(column), filled(sigma), filled(reason)) };
     // SAFETY: as above.
     let (modulation, background) = unsafe { (filled(modulation), filled(background)) };

@@ -566,13 +566,13 @@ def write_scanner(path: str | os.PathLike[str], found: ScannerCalibration) -> Sc
         "undetermined": found.undetermined,
         "warnings": found.warnings,
     }
-    _write_text(path, to_json(plain(document)))
+    write_whole(path, to_json(plain(document)))
     return read_scanner(path)
 
 
-def _write_text(path: Path, text: str) -> None:
+def write_whole(path: Path, text: str) -> None:
     """A file that appears complete or not at all."""
-    partial = path.parent / f".{path.name}.{secrets.token_hex(4)}.partial"
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
     try:
         partial.write_text(text, encoding="utf-8")
         partial.replace(path)
@@ -627,7 +627,7 @@ def write_hand_eye(path: str | os.PathLike[str], hand_eye: HandEye) -> HandEyeSp
         **{field.name: getattr(hand_eye, field.name) for field in fields(hand_eye) if field.name != "per_shot"},
         "per_shot": shots,
     }
-    _write_text(path, to_json(plain(document)))
+    write_whole(path, to_json(plain(document)))
     return read_hand_eye(path)
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import secrets
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,6 +49,7 @@ from weldscan.session import (
     read_hand_eye,
     read_text,
     to_json,
+    write_whole,
 )
 
 Floats = NDArray[np.float64]
@@ -479,14 +479,7 @@ def check_plan(path: Path) -> None:
 def write_plan(path: Path, text: str) -> None:
     """Writes the document; the file appears whole or not at all."""
     check_plan(path)
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
-    finally:
-        partial.unlink(missing_ok=True)
+    write_whole(path, text)
 
 
 def mount_of(text: str) -> Floats:

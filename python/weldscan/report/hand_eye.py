@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import secrets
 from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
@@ -16,6 +15,7 @@ from weldscan._weldcore import __version__
 from weldscan.errors import InputError
 from weldscan.report.charts import LEFT, RIGHT, WIDTH, Svg, nice_ticks, number
 from weldscan.result import HandEye
+from weldscan.session import write_whole
 
 MARK = '<meta name="generator" content="weldscan calibrate">'
 
@@ -54,14 +54,7 @@ def write_page(path: Path, template: str, **values: Any) -> Path:
         mm=lambda v: "–" if v is None or not math.isfinite(v) else f"{v:.3f}".replace("-", "−"),
         **drawn,
     )
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
-    finally:
-        partial.unlink(missing_ok=True)
+    write_whole(path, text)
     return path
 
 

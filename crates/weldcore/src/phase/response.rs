@@ -101,7 +101,7 @@ impl PhaseError {
     /// A known one.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for fewer than three steps, more than [`TERMS`] coefficients, one that is not finite, and
+    /// [`Error::OutOfRange`] for fewer than three steps, more than 16 coefficients, one that is not finite, and
     /// a series that no phase can have: two phases would be measured as one.
     pub fn given(steps: usize, sin_rad: &[f64]) -> Result<Self> {
         let wrong = |expected: String, value: String| Err(Error::OutOfRange { what: "phase_error", expected, value });

@@ -339,7 +339,7 @@ def _(scale: float) -> Job:
 
 @job("decode_gray")
 def _(scale: float) -> Job:
-    code = np.arange(round(100_000 * scale)).reshape(100, -1) * 1024 // round(100_000 * scale)
+    code = np.arange(100 * round(1000 * scale)).reshape(100, -1) * 1024 // (100 * round(1000 * scale))
     gray = code ^ (code >> 1)
     images = [np.uint8(30 + 150 * (gray >> b & 1)) for b in reversed(range(10))]
     wrapped = np.angle(np.exp(1j * 2 * np.pi * 512 * np.arange(code.size).reshape(code.shape) / code.size))

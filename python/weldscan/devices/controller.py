@@ -77,6 +77,8 @@ class Arm:
         self._geometry, self._joints = ArmGeometry(), HOME_JOINTS
         self._held: KukaPose | None = None
         """The flange that these joints hold."""
+        self._aim: Joints | None = None
+        """The joints that a motion was to end in, if they were what it was given by."""
         self.speed_mm_s, self.turn_speed_deg_s = T1_SPEED_MM_S, TURN_SPEED_DEG_S
         self._start_s, self._seconds = time.monotonic(), 0.0
         self._frozen: KukaPose | None = None
@@ -100,8 +102,12 @@ class Arm:
 
     @property
     def joints_deg(self) -> Joints:
-        """A1 to A6 now: of the ways to hold the flange the one nearest to where the joints were."""
+        """A1 to A6 now: of the ways to hold the flange the one nearest to where the joints were; where a motion was given
+        by its joints, those at its end.
+        """
         flange = self.flange()
+        if self._aim is not None and not self.moving:
+            self._joints, self._held = self._aim, flange
         if flange != self._held:
             self._joints = self._geometry.joints(flange.matrix(), self._joints) or self._joints
             self._held = flange
@@ -115,19 +121,19 @@ class Arm:
         far_mm, far_deg = distance(self._start, target)
         self._start_s = time.monotonic()
         self._seconds = max(far_mm / self.speed_mm_s, far_deg / self.turn_speed_deg_s)
-        self._target = target
+        self._target, self._aim = target, None
 
     def move_joints(self, joints_deg: Joints) -> None:
         """Set off for a pose that is given by its joints."""
         self.move(KukaPose.from_matrix(self._geometry.flange(joints_deg)))
-        self._joints, self._held = joints_deg, None
+        self._aim = joints_deg
 
     def place(self, target: KukaPose) -> None:
         """Be at a pose at once, as when an operator has jogged the arm there; for a far one the arm is a larger one."""
         while self._geometry.joints(target.matrix(), self._joints) is None:
             self._geometry = self._geometry.larger(2.0)
         self._start = self._target = target
-        self._seconds = 0.0
+        self._seconds, self._aim = 0.0, None
 
     def position(self, fault: Fault | None = None) -> KukaPose:
         """Return $POS_ACT: the tool in base."""

@@ -102,8 +102,9 @@ class Arm:
 
     @property
     def joints_deg(self) -> Joints:
-        """A1 to A6 now: of the ways to hold the flange the one nearest to where the joints were; where a motion was given
-        by its joints, those at its end.
+        """A1 to A6 now: of the ways to hold the flange the one nearest to where the joints were.
+
+        Where a motion was given by its joints it ends in those.
         """
         flange = self.flange()
         if self._aim is not None and not self.moving:

@@ -346,7 +346,13 @@ def response_record(
         record["table"] = response.document()["id"]
     elif record["mode"] == "table":
         record["table"] = f"{os.fspath(response)} ({read_response(response).document()['id']})"
-    if taken:
+    if taken and record["mode"] == "auto" and 2 * len(taken) < len(errors):
+        # One projector lit them all: what few shots show is of their own making.
+        record["note"] = (
+            f"{', '.join(sorted(taken))}: the phase shows an error of up to {record['largest_rad']:.4f} rad that repeats "
+            "with the fringes and was taken off; most shots show none, so that it is hardly the projector's response"
+        )
+    elif taken:
         by = "by the table given" if record["table"] else "as the fringes themselves show it"
         record["note"] = (
             f"the projector's light is not proportional to its level: the phase of {len(taken)} of {len(errors)} shots "

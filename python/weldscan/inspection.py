@@ -349,7 +349,7 @@ def response_record(
     if taken and record["mode"] == "auto" and 2 * len(taken) < len(errors):
         # One projector lit them all: what few shots show is of their own making.
         record["note"] = (
-            f"{', '.join(sorted(taken))}: the phase shows an error of up to {record['largest_rad']:.4f} rad that repeats "
+            f"{', '.join(sorted(taken))}: an error of the phase of up to {record['largest_rad']:.4f} rad that repeats "
             "with the fringes and was taken off; most shots show none, so that it is hardly the projector's response"
         )
     elif taken:

@@ -437,6 +437,8 @@ def test_the_page_names_outliers(tmp_path):
     assert "artefact-4: an outlier, not used: 0." in text and "artefact-4 (not used)" in text
     assert "cell &lt;7&gt;" in text and text.count('class="dot"') == 3 * len(views)
     ElementTree.fromstring(re.search(r"<svg.*?</svg>", text, re.DOTALL)[0])
+    write_hand_eye_page(solve_hand_eye(views, poses, touched), page, "<svg onload=x>")
+    assert "&lt;svg onload" in page.read_text() and "<svg onload" not in page.read_text()
     write_hand_eye_page(solve_hand_eye(views[:1], poses[:1], touched), page)
     page.write_text("mine")
     with pytest.raises(InputError, match="is no page of a calibration"):

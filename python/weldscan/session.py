@@ -661,17 +661,23 @@ def named_scanner(path: Path, name: str) -> dict[str, Any]:
     return read_scanner(path.parent / name).model_dump(mode="json", by_alias=True, exclude_none=True)
 
 
-def read_text(path: Path) -> str:
-    """A small text file in UTF-8; whatever is wrong with it is an `InputError` that names it."""
+def read_bytes(path: Path, most: int = MAX_JSON_BYTES, what: str = "file") -> bytes:
+    """A file of at most so many bytes; whatever is wrong with it is an `InputError` that names it."""
     try:
         with path.open("rb") as file:
-            data = file.read(MAX_JSON_BYTES + 1)
+            data = file.read(most + 1)
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        raise InputError(f"{path}: no such {what}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if len(data) > MAX_JSON_BYTES:
-        raise InputError(f"{path}: is larger than {MAX_JSON_BYTES >> 20} MB")
+    if len(data) > most:
+        raise InputError(f"{path}: is larger than {most >> 20} MB")
+    return data
+
+
+def read_text(path: Path) -> str:
+    """A small text file in UTF-8; whatever is wrong with it is an `InputError` that names it."""
+    data = read_bytes(path)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

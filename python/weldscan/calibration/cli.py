@@ -69,7 +69,8 @@ def hand_eye(
     are named and not used.
     """
     from weldscan.calibration.hand_eye import calibrate as solve
-    from weldscan.report.hand_eye import check_page, write_hand_eye_page
+    from weldscan.report.hand_eye import write_hand_eye_page
+    from weldscan.report.page import check_page
     from weldscan.session import write_hand_eye
 
     page = page if page is not None else out.with_suffix(".html")
@@ -127,7 +128,7 @@ def plan(
 
     from weldscan.calibration import plan as planning
     from weldscan.errors import InputError
-    from weldscan.report.hand_eye import check_page
+    from weldscan.report.page import check_page
     from weldscan.report.plan import write_plan_page
     from weldscan.session import read_hand_eye
 
@@ -248,7 +249,7 @@ def scanner(
     """
     from weldscan.calibration.board import parse_board
     from weldscan.calibration.scanner import calibrate_scanner
-    from weldscan.report.hand_eye import check_page
+    from weldscan.report.page import check_page
     from weldscan.report.scanner import write_scanner_page
     from weldscan.session import read_scanner, write_scanner
 

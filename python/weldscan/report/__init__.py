@@ -11,14 +11,13 @@ from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields, replace
 from datetime import UTC, datetime
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from weldscan._weldcore import __version__
-from weldscan.report import charts, pictures
+from weldscan.report import charts, page, pictures
 from weldscan.result import ArtefactShot, HandEye, Inspection, Judgement, Label, PartCloud, StepResult, Verdict
 from weldscan.session import plain, to_json, whole_folder
 
@@ -259,12 +258,8 @@ def html(inspection: Inspection, created: datetime) -> str:
 
 
 def _page(inspection: Inspection, created: datetime, view: Future[str | None], unrolled: Future[str | None]) -> str:
-    from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
 
-    here = resources.files(__name__)
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string((here / "template.html").read_text(encoding="utf-8"))
     step, cloud, hand_eye = inspection.step, inspection.cloud, inspection.hand_eye
     worst = next((j for j in inspection.verdicts if j.verdict == inspection.verdict), None)
     limits = [j.limit_mm for j in inspection.verdicts if j.limit_mm is not None]
@@ -282,13 +277,12 @@ def _page(inspection: Inspection, created: datetime, view: Future[str | None], u
     drawings["map_chart"] = unrolled.result()
     budget = [(line, line.standard_mm**2) for line in (step.budget if step else ())]
     total = sum(square for _, square in budget)
-    return template.render(
+    return page.fill(
+        "template.html",
+        created,
         r=inspection,
         s=step,
         h=hand_eye,
-        css=Markup((here / "style.css").read_text(encoding="utf-8")),
-        version=__version__,
-        created=created.strftime("%Y-%m-%d %H:%M UTC"),
         report_id=report_id(inspection, created),
         verdict=inspection.verdict.value,
         icon=ICONS[inspection.verdict],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 
 import numpy as np
@@ -53,6 +53,17 @@ class Svg:
             "text", content, transform=f"translate({x:.0f} {y:.0f}) rotate(-90)", class_="axis", text_anchor="middle"
         )
 
+    def value_axis(self, top: float, bottom: float, ticks: Iterable[float], y: Callable[[float], float]) -> None:
+        """The panel of a chart as wide as the page, with its ticks."""
+        self.add("rect", x=LEFT, y=top, width=WIDTH - LEFT - RIGHT, height=bottom - top, class_="panel")
+        self.value_ticks(ticks, y)
+
+    def value_ticks(self, ticks: Iterable[float], y: Callable[[float], float]) -> None:
+        """A line across the chart and a number at each tick."""
+        for tick in ticks:
+            self.line(LEFT, y(tick), WIDTH - RIGHT, y(tick), "zero" if tick == 0 else "grid")
+            self.text(LEFT - 9, y(tick) + 4, number(tick), "tick", "end")
+
     def colour_bar(self, y: float, scale_mm: float, below: str, above: str) -> None:
         """The diverging scale from -`scale_mm` to `scale_mm`."""
         x0, x1 = WIDTH * 0.28, WIDTH * 0.72
@@ -70,6 +81,9 @@ class Svg:
 
     def __str__(self) -> str:
         return "".join(self.parts) + "</svg>"
+
+    # What is written into a page as it is: all text in it has been escaped.
+    __html__ = __str__
 
 
 def nice_ticks(low: float, high: float, about: int) -> list[float]:
@@ -163,9 +177,7 @@ def step_chart(step: StepResult, limit_mm: float | None, judged: tuple[float, fl
         return bottom - (value - low) / (high - low) * (bottom - top)
 
     angles.draw(svg, top, bottom)
-    for tick in nice_ticks(low, high, 7):
-        svg.line(LEFT, y(tick), WIDTH - RIGHT, y(tick), "zero" if tick == 0 else "grid")
-        svg.text(LEFT - 9, y(tick) + 4, number(tick), "tick", "end")
+    svg.value_ticks(nice_ticks(low, high, 7), y)
     svg.upright(16, (top + bottom) / 2, "step, mm")
     for limit in () if limit_mm is None else (limit_mm, -limit_mm):
         if low <= limit <= high:

@@ -4,20 +4,13 @@ from __future__ import annotations
 
 import math
 import os
-from datetime import UTC, datetime
-from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from weldscan._weldcore import __version__
-from weldscan.errors import InputError
-from weldscan.report.charts import LEFT, RIGHT, WIDTH, Svg, nice_ticks, number
+from weldscan.report.charts import LEFT, RIGHT, WIDTH, Svg, nice_ticks
+from weldscan.report.page import write_page
 from weldscan.result import HandEye
-from weldscan.session import write_whole
-
-MARK = '<meta name="generator" content="weldscan calibrate">'
 
 
 def write_hand_eye_page(found: HandEye, path: str | os.PathLike[str], session: str = "") -> Path:
@@ -31,39 +24,10 @@ def write_hand_eye_page(found: HandEye, path: str | os.PathLike[str], session: s
         "hand_eye.html",
         h=found,
         session=session,
-        residuals=str(residuals(found)),
+        residuals=residuals(found),
         matrix=matrix(found),
         degrees=math.degrees,
     )
-
-
-def write_page(path: Path, template: str, **values: Any) -> Path:
-    """Fills a template of this folder into a file that appears whole; names of drawings are those that hold SVG."""
-    from jinja2 import Environment, StrictUndefined
-    from markupsafe import Markup
-
-    check_page(path)
-    here = resources.files("weldscan.report")
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    drawn = {k: Markup(v) if isinstance(v, str) and v.startswith("<svg") else v for k, v in values.items()}
-    text = environment.from_string((here / template).read_text(encoding="utf-8")).render(
-        css=Markup((here / "style.css").read_text(encoding="utf-8")),
-        mark=Markup(MARK),
-        version=__version__,
-        created=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        mm=lambda v: "–" if v is None or not math.isfinite(v) else f"{v:.3f}".replace("-", "−"),
-        **drawn,
-    )
-    write_whole(path, text)
-    return path
-
-
-def check_page(path: Path) -> None:
-    """Says early what would be in the way of a page."""
-    if path.exists() and (not path.is_file() or MARK not in path.read_text(encoding="utf-8", errors="replace")[:2000]):
-        raise InputError(f"{path}: exists and is no page of a calibration: remove it or name another")
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path}: cannot be written: {path.absolute().parent} is not a folder")
 
 
 def matrix(found: HandEye) -> str:
@@ -83,10 +47,7 @@ def residuals(found: HandEye) -> Svg:
     def y(value: float) -> float:
         return bottom - value / high * (bottom - top)
 
-    svg.add("rect", x=LEFT, y=top, width=WIDTH - LEFT - RIGHT, height=bottom - top, class_="panel")
-    for tick in nice_ticks(0.0, high, 6):
-        svg.line(LEFT, y(tick), WIDTH - RIGHT, y(tick), "zero" if tick == 0 else "grid")
-        svg.text(LEFT - 9, y(tick) + 4, number(tick), "tick", "end")
+    svg.value_axis(top, bottom, nice_ticks(0.0, high, 6), y)
     step = (WIDTH - LEFT - RIGHT) / max(len(found.per_shot), 1)
     for i, shot in enumerate(found.per_shot):
         middle = LEFT + (i + 0.5) * step

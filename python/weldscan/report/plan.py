@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from weldscan.report.charts import LEFT, RIGHT, WIDTH, Svg, nice_ticks, number
-from weldscan.report.hand_eye import write_page
+from weldscan.report.page import write_page
 
 if TYPE_CHECKING:
     from weldscan.calibration.plan import Plan
@@ -24,8 +24,8 @@ def write_plan_page(found: Plan, path: str | os.PathLike[str], name: str = "") -
         "plan.html",
         p=found,
         name=name,
-        views=str(views(found)),
-        gain=str(gain(found)),
+        views=views(found),
+        gain=gain(found),
         degrees=math.degrees,
     )
 
@@ -99,10 +99,7 @@ def gain(found: Plan) -> Svg:
     def y(value: float) -> float:
         return bottom - value / high * (bottom - top)
 
-    svg.add("rect", x=LEFT, y=top, width=WIDTH - LEFT - RIGHT, height=bottom - top, class_="panel")
-    for tick in nice_ticks(0.0, high, 5):
-        svg.line(LEFT, y(tick), WIDTH - RIGHT, y(tick), "zero" if tick == 0 else "grid")
-        svg.text(LEFT - 9, y(tick) + 4, number(tick), "tick", "end")
+    svg.value_axis(top, bottom, nice_ticks(0.0, high, 5), y)
     points = [(x(i + 1), y(v)) for i, v in enumerate(values) if not math.isnan(v)]
     svg.path(points, "curve")
     for px, py in points:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldscan.report.charts import Svg
-from weldscan.report.hand_eye import write_page
+from weldscan.report.page import write_page
 from weldscan.result import BoardPose, ScannerCalibration
 
 Floats = NDArray[np.float64]
@@ -31,12 +31,10 @@ def write_scanner_page(found: ScannerCalibration, path: str | os.PathLike[str]) 
         Path(path),
         "scanner.html",
         c=found,
-        everything=[str(vectors(found, found.poses, device, scales[device])) for device in (0, 1)],
-        each=[
-            (pose, [str(vectors(found, (pose,), device, scales[device])) for device in (0, 1)]) for pose in found.poses
-        ],
+        everything=[vectors(found, found.poses, device, scales[device]) for device in (0, 1)],
+        each=[(pose, [vectors(found, (pose,), device, scales[device]) for device in (0, 1)]) for pose in found.poses],
         scales=scales,
-        tilts=str(tilts(found)),
+        tilts=tilts(found),
         rows=[
             (name, value, u, name.split(".")[1] if "." in name else name)
             for name, value, u in zip(

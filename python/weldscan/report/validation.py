@@ -6,14 +6,14 @@ import json
 import math
 import os
 from datetime import UTC, datetime
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from weldscan._weldcore import __version__
-from weldscan.report.charts import LEFT, RIGHT, WIDTH, AngleAxis, Svg, arcs_of, nice_ticks, number
+from weldscan.report.charts import LEFT, RIGHT, WIDTH, AngleAxis, Svg, arcs_of, nice_ticks
+from weldscan.report.page import fill
 from weldscan.report.pictures import diverging
 from weldscan.result import Validation
 from weldscan.session import plain, to_json, whole_folder
@@ -76,24 +76,18 @@ def _rows(found: Validation) -> list[list[float]]:
 
 
 def html(found: Validation, created: datetime) -> str:
-    """The page: one file without any reference to another."""
-    from jinja2 import Environment, StrictUndefined
-    from markupsafe import Markup
-
-    here = resources.files("weldscan.report")
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    """The page."""
 
     def shown(value: float, digits: int = 3) -> str:
         return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else "–"
 
-    return environment.from_string((here / "validation.html").read_text(encoding="utf-8")).render(
+    return fill(
+        "validation.html",
+        created,
         v=found,
-        css=Markup((here / "style.css").read_text(encoding="utf-8")),
-        version=__version__,
-        created=created.strftime("%Y-%m-%d %H:%M UTC"),
         typical_u=float(np.nanmedian(found.u_mm)),
-        where=Markup(str(where(found))),
-        distances=Markup(str(distances(found))),
+        where=where(found),
+        distances=distances(found),
         rows=_rows(found),
         mm=shown,
         number=shown,
@@ -114,9 +108,7 @@ def where(found: Validation) -> Svg:
     def y(value: float) -> float:
         return top + (high - value) / (high - low) * (bottom - top)
 
-    for tick in nice_ticks(low, high, 5):
-        svg.line(LEFT, y(tick), WIDTH - RIGHT, y(tick), "zero" if tick == 0 else "grid")
-        svg.text(LEFT - 9, y(tick) + 4, number(tick), "tick", "end")
+    svg.value_ticks(nice_ticks(low, high, 5), y)
     svg.upright(16, (top + bottom) / 2, "along the axis, mm")
     scale = next((s for s in (0.05, 0.1, 0.2, 0.5, 1.0, 2.0) if s >= found.max_abs_mm), found.max_abs_mm)
     for angle, axial, distance in zip(found.angle_deg, found.axial_mm, found.distance_mm, strict=True):
@@ -145,10 +137,7 @@ def distances(found: Validation) -> Svg:
     def y(value: float) -> float:
         return (top + bottom) / 2 - value / reach * (bottom - top) / 2
 
-    svg.add("rect", x=LEFT, y=top, width=WIDTH - LEFT - RIGHT, height=bottom - top, class_="panel")
-    for tick in nice_ticks(-reach, reach, 7):
-        svg.line(LEFT, y(tick), WIDTH - RIGHT, y(tick), "zero" if tick == 0 else "grid")
-        svg.text(LEFT - 9, y(tick) + 4, number(tick), "tick", "end")
+    svg.value_axis(top, bottom, nice_ticks(-reach, reach, 7), y)
     for limit in (PAPER_MM, -PAPER_MM):
         svg.line(LEFT, y(limit), WIDTH - RIGHT, y(limit), "limit")
     for place, i in enumerate(order):

@@ -7,7 +7,6 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from weldscan._weldcore import __version__
 from weldscan.report import ICONS
 from weldscan.report.charts import LEFT, RIGHT, WIDTH, Svg, nice_ticks, number
+from weldscan.report.page import fill
 from weldscan.report.pictures import data_uri, diverging
 from weldscan.result import Characteristic, Drift, Verification
 from weldscan.session import plain, to_json, whole_folder
@@ -96,11 +96,6 @@ def _row(each: Any) -> dict[str, Any]:
 
 def html(found: Verification, created: datetime) -> str:
     """The page: one file without any reference to another."""
-    from jinja2 import Environment, StrictUndefined
-    from markupsafe import Markup
-
-    here = resources.files("weldscan.report")
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
 
     def shown(value: float | None, digits: int = 4) -> str:
         if value is None or not math.isfinite(value):
@@ -108,23 +103,18 @@ def html(found: Verification, created: datetime) -> str:
         return f"{value:.{digits}f}".replace("-", "−")
 
     ball_scale, plane_scale = (scale_of(each.residual_mm for each in some) for some in (found.balls, found.planes))
-    return environment.from_string((here / "verification.html").read_text(encoding="utf-8")).render(
+    return fill(
+        "verification.html",
+        created,
         v=found,
-        css=Markup((here / "style.css").read_text(encoding="utf-8")),
-        version=__version__,
-        created=created.strftime("%Y-%m-%d %H:%M UTC"),
         icon=ICONS[found.verdict],
         why=why(found),
-        volumes=[
-            (each, Markup(str(volume(found, each)))) for each in found.characteristics if each.value_mm is not None
-        ],
+        volumes=[(each, volume(found, each)) for each in found.characteristics if each.value_mm is not None],
         ball_scale=ball_scale,
         plane_scale=plane_scale,
         ball_maps=[(ball, residual_map(ball.residual_mm, ball_scale)) for ball in found.balls],
         plane_maps=[(plane, residual_map(plane.residual_mm, plane_scale)) for plane in found.planes],
-        drifts=[
-            (each, Markup(str(drift_chart(each, found[each.name])))) for each in found.drift if len(each.dates) > 1
-        ],
+        drifts=[(each, drift_chart(each, found[each.name])) for each in found.drift if len(each.dates) > 1],
         mm=shown,
     )
 
@@ -245,10 +235,7 @@ def drift_chart(drift: Drift, characteristic: Characteristic) -> Svg:
     def y(value: float) -> float:
         return bottom - (value - low) / (high - low) * (bottom - top)
 
-    svg.add("rect", x=LEFT, y=top, width=WIDTH - LEFT - RIGHT, height=bottom - top, class_="panel")
-    for tick in nice_ticks(low, high, 5):
-        svg.line(LEFT, y(tick), WIDTH - RIGHT, y(tick), "zero" if tick == 0 else "grid")
-        svg.text(LEFT - 9, y(tick) + 4, number(tick), "tick", "end")
+    svg.value_axis(top, bottom, nice_ticks(low, high, 5), y)
     for bound in () if limit is None else (limit, -limit):
         if low <= bound <= high:
             svg.line(LEFT, y(bound), WIDTH - RIGHT, y(bound), "limit")

@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from weldscan.errors import InputError
 from weldscan.manifest import sync_folder
 from weldscan.result import Drift, Standing, Verdict, Verification
-from weldscan.session import Session, plain
+from weldscan.session import Session, plain, read_bytes
 from weldscan.verification import CLOCK_SKEW, fringes_of, moment, scanner_id
 
 try:
@@ -127,16 +127,7 @@ def read_history(path: str | os.PathLike[str]) -> History:
         InputError: no such file, it cannot be read, or it holds something else.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such history") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if len(data) > MAX_BYTES:
-        raise InputError(f"{path}: is larger than {MAX_BYTES >> 20} MB")
-    return _parse(path, data)
+    return _parse(path, read_bytes(path, MAX_BYTES, "history"))
 
 
 def _parse(path: Path, data: bytes) -> History:

@@ -46,6 +46,7 @@ pub mod place;
 pub mod scanner;
 pub mod segment;
 pub mod simulate;
+mod statistics;
 pub mod step;
 pub mod threads;
 pub mod transform;

@@ -135,11 +135,6 @@ fn request_huge_pages(start: *mut u8, _: usize) -> *mut u8 {
     start
 }
 
-/// `n` zeros.
-pub(crate) fn zeros<T: Copy + Default>(n: usize) -> Vec<T> {
-    vec![T::default(); n]
-}
-
 /// Room for `n` values that are all going to be written: clearing it first would take as long as writing it.
 pub(crate) fn room<T: Copy>(n: usize) -> Vec<MaybeUninit<T>> {
     let mut values = Vec::with_capacity(n);

@@ -18,6 +18,7 @@ use rayon::prelude::*;
 use crate::Vec3;
 use crate::error::{Error, Result, require_positive};
 use crate::fit::{Noise, cylinder};
+use crate::statistics::median;
 use crate::threads;
 
 /// What a point belongs to; the numbers are those of `weldscan.result.Label`.
@@ -336,15 +337,6 @@ fn refine_centre(seen: &[(Vec3, Vec3)], frame: &mut PipeFrame) {
 /// Tukey's biweight, zero beyond 1.
 fn tukey(u: f64) -> f64 {
     if u.abs() < 1.0 { (1.0 - u * u).powi(2) } else { 0.0 }
-}
-
-/// The median; 0 of nothing. Reorders.
-fn median(values: &mut [f64]) -> f64 {
-    if values.is_empty() {
-        return 0.0;
-    }
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
 /// The unrolled shot cut into sectors and axial bins.

@@ -33,6 +33,7 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::segment::Label;
+use crate::statistics::median;
 use crate::threads;
 
 /// One shot, unrolled and labelled (see [`crate::segment`]).
@@ -492,14 +493,6 @@ impl Whitener {
         self.apply(&mut ones);
         variance * ones.iter().map(|v| v * v).sum::<f64>()
     }
-}
-
-fn median(values: &mut [f64]) -> f64 {
-    if values.is_empty() {
-        return 0.0;
-    }
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
 /// Sums of a wall's points over a grid of cells.

@@ -5,7 +5,6 @@ use rayon::prelude::*;
 
 use super::wave::{TILE, Wave, atan2};
 use crate::error::{Error, Result};
-use crate::memory::zeros;
 use crate::threads::{self, CHUNK};
 
 /// What [`decode_phase`] found; everything set after set, each row-major.
@@ -83,10 +82,10 @@ pub fn decode_phase<T: Copy + Into<f64> + Sync>(images: &[&[T]], steps: &[usize]
     }
     let size = n * steps.len();
     let mut out = WrappedPhase {
-        phase_rad: zeros(size),
-        modulation: zeros(size),
-        background: zeros(size),
-        residual: zeros(size),
+        phase_rad: vec![0.0; size],
+        modulation: vec![0.0; size],
+        background: vec![0.0; size],
+        residual: vec![0.0; size],
     };
     let mut first = 0;
     for (set, &steps) in steps.iter().enumerate() {

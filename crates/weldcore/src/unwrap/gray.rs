@@ -5,6 +5,7 @@ use std::f64::consts::{FRAC_PI_2, TAU};
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
+use crate::statistics::median;
 use crate::threads::{self, CHUNK};
 
 /// What the bit images are compared with.
@@ -40,30 +41,29 @@ fn least_contrast<T: Copy + Into<f64>>(bits: &[&[T]], against: &GrayImages<'_, T
         GrayImages::WhiteBlack(white, black) => {
             let swing = |i: &usize| at(white, *i) - at(black, *i);
             let lit: Vec<usize> = (0..n).step_by(stride).filter(|i| swing(i) > 0.0).collect();
-            let middle = median(lit.iter().map(swing).collect());
+            let middle = finite_median(lit.iter().map(swing).collect());
             let bright = lit.iter().filter(|i| swing(i) >= middle);
             let misses = bright.flat_map(|&i| {
                 let (white, black) = (at(white, i), at(black, i));
                 bits.iter().map(move |b| (at(b, i) - white).abs().min((at(b, i) - black).abs()))
             });
             // A miss is of two levels; twice the level less white and black, of six.
-            Z * 3f64.sqrt() * (MAD * median(misses.collect())).max(floor * 2f64.sqrt())
+            Z * 3f64.sqrt() * (MAD * finite_median(misses.collect())).max(floor * 2f64.sqrt())
         }
         GrayImages::Inverse(inverse) => {
             let sums = |i: usize| bits.iter().zip(*inverse).map(move |(a, b)| at(a, i) + at(b, i));
             let differ = |i: usize| sums(i).zip(sums(i).skip(1)).map(|(a, b)| (a - b).abs());
             let differences: Vec<f64> = (0..n).step_by(stride).flat_map(differ).collect();
-            let level = if bits.len() < 2 { 1.0 } else { (MAD * median(differences) / 2.0).max(floor) };
+            let level = if bits.len() < 2 { 1.0 } else { (MAD * finite_median(differences) / 2.0).max(floor) };
             Z * 2f64.sqrt() * level
         }
     }
 }
 
 /// The median of the finite ones; 0 of none.
-fn median(mut values: Vec<f64>) -> f64 {
+fn finite_median(mut values: Vec<f64>) -> f64 {
     values.retain(|v| v.is_finite());
-    let middle = values.len() / 2;
-    if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f64::total_cmp).1 }
+    median(&mut values)
 }
 
 /// The code of each pixel from its bit images, most significant first; -1 where a bit cannot be told because the

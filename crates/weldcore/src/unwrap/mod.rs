@@ -19,7 +19,6 @@ pub use gray::{GrayImages, absolute_from_gray, decode_gray};
 pub use spatial::unwrap_spatial;
 
 use crate::error::{Error, Result};
-use crate::memory::zeros;
 use crate::phase::round64;
 use crate::threads::{self, CHUNK};
 
@@ -236,7 +235,7 @@ pub fn unwrap_temporal(wrapped: &[&[f64]], periods: &[f64], z: f64) -> Result<Ve
         }
         own + TAU * order
     };
-    let mut out = zeros(n);
+    let mut out = vec![0.0; n];
     threads::install(|| {
         out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, values): (usize, &mut [f64])| {
             values.iter_mut().enumerate().for_each(|(i, v)| *v = absolute(chunk * CHUNK + i));

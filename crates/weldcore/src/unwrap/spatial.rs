@@ -12,7 +12,6 @@ use std::f64::consts::TAU;
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
-use crate::memory::zeros;
 use crate::phase::{round, round64};
 use crate::threads::{self, CHUNK};
 
@@ -234,7 +233,7 @@ pub fn unwrap_spatial(
         threads::install(|| corners.into_par_iter().map(|(left, top)| join_tile(&image, left, top)).collect());
 
     // Second round: the groups of all tiles, and the joints that wait.
-    let mut group = zeros::<(u32, i32)>(n);
+    let mut group = vec![(0u32, 0i32); n];
     let mut waiting = Vec::new();
     for tile in &tiles {
         for (y, row) in tile.group.chunks(tile.width).enumerate().take(tile.height) {
@@ -268,7 +267,7 @@ pub fn unwrap_spatial(
         let kept = whole(wrapped[first as usize]) - whole(wrapped[i]);
         wrapped[i] + TAU * (f64::from(turns + more) + kept)
     };
-    let mut out = zeros(n);
+    let mut out = vec![0.0; n];
     threads::install(|| {
         out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, values): (usize, &mut [f64])| {
             values.iter_mut().enumerate().for_each(|(i, v)| *v = answer(chunk * CHUNK + i));

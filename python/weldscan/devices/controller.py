@@ -10,6 +10,7 @@ import os
 import socket
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator
 from enum import StrEnum
@@ -174,7 +175,7 @@ class Controller:
         self.close()
 
 
-class StreamController(Controller):
+class StreamController(Controller, ABC):
     """Answers requests over a byte stream. A link says how a request is cut, what is answered and how it can be
     spoilt.
     """
@@ -182,13 +183,13 @@ class StreamController(Controller):
     restart_s = 1.0
     """How long a restart takes."""
 
+    @abstractmethod
     def cut(self, buffer: bytearray) -> bytes | None:
         """Cut one request off the front."""
-        raise NotImplementedError
 
+    @abstractmethod
     def answer(self, request: bytes, fault: Fault | None) -> bytes:
         """Give the reply, with the fault in its content where the fault is one of content."""
-        raise NotImplementedError
 
     def serve(self, transport: Transport) -> None:
         """Answer until the other side goes away."""

@@ -17,6 +17,7 @@ from weldscan.result import (
     PartCloud,
     SphereFit,
     StepResult,
+    warning,
 )
 
 PART = {
@@ -160,7 +161,7 @@ def inspection(
         cloud=cloud(points),
         verdicts=verdicts,
         left_out=(("artefact-7", "only two spheres of 20 mm in view"),),
-        warnings=("the part covers only 61 % of part-2",),
+        findings=(warning("coverage", "the part covers only 61 % of part-2", "part-2"),),
         masks=masks,
         timing_s={"read": 0.61, "decode": 0.18, "triangulate": 0.11, "spheres": 0.09, "segment": 0.1, "step": 0.08},
         software={"weldscan": "0.1.0", "python": "3.11.7", "numpy": "2.4.6", "session_sha256": "7e" * 32},

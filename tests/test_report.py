@@ -17,7 +17,7 @@ from weldscan import InputError
 from weldscan.report import FILES, write_report
 from weldscan.report.charts import arcs_of, nice_ticks
 from weldscan.report.pictures import diverging
-from weldscan.result import Label
+from weldscan.result import Label, bar
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,8 @@ def test_the_page_is_self_contained_and_well_formed(made, tmp_path):
 def test_names_from_outside_are_escaped(made, tmp_path):
     evil = "<script>alert(1)</script>"
     write_report(
-        replace(made, session=evil, warnings=(evil,), left_out=((evil, evil),), software={"x": evil}), tmp_path / "out"
+        replace(made, session=evil, findings=(bar("cap", evil),), left_out=((evil, evil),), software={"x": evil}),
+        tmp_path / "out",
     )
     assert "<script" not in (tmp_path / "out" / "report.html").read_text()
 

@@ -10,7 +10,6 @@ import os
 import platform
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from typing import Any, Literal, cast
 
@@ -29,6 +28,7 @@ from weldscan.errors import GeometryError, InputError
 from weldscan.manifest import left_out as left_out_of
 from weldscan.norms import judge, load_norm
 from weldscan.paper_method import paper_step
+from weldscan.part_views import PartView
 from weldscan.points import Compensate, PointReader, Progress
 from weldscan.response import Response, read_response
 from weldscan.result import (
@@ -40,6 +40,8 @@ from weldscan.result import (
     ScannerRecord,
     ShotAgreement,
     StepResult,
+    note,
+    warning,
 )
 from weldscan.session import PartSpec, ShotSpec, read_session
 from weldscan.verification.history import standing_of
@@ -102,23 +104,6 @@ def inspect(
     return run.judged(step, cloud, hand_eye)
 
 
-@dataclass(frozen=True, eq=False)
-class _Weld:
-    """One segmented part shot."""
-
-    index: int
-    points_mm: Floats
-    """(H, W, 3), scanner frame, NaN where there is none."""
-    base_from_scanner: Floats
-    shot: WeldShot
-
-    @property
-    def axis_in_base(self) -> tuple[Floats, Floats]:
-        """A point of the pipe's axis, and its direction."""
-        turn, shift = self.base_from_scanner[:3, :3], self.base_from_scanner[:3, 3]
-        return turn @ self.shot.origin_mm + shift, turn @ self.shot.axis
-
-
 class _Run:
     """One inspection under way: the session, and what went wrong."""
 
@@ -149,7 +134,7 @@ class _Run:
         unusable = {name for name, _ in self.left_out}
         self.part_shots = [shot for shot in self.session.part_shots if shot.name not in unusable]
 
-    def weld(self, shot: ShotSpec, hand_eye: HandEye | None) -> _Weld | None:
+    def weld(self, shot: ShotSpec, hand_eye: HandEye | None) -> PartView | None:
         """Steps 5 and 6: one part shot, placed and segmented; None with the reason kept."""
         base_from_scanner = np.eye(4)
         if self.session.has_robot:
@@ -157,29 +142,38 @@ class _Run:
                 self.left_out.append((shot.name, "no artefact shot could be used, so its place in base is unknown"))
                 return None
             base_from_scanner = base_from_flange(shot) @ hand_eye.flange_from_scanner
-        cloud = self.read(shot)
+        scan = self.read(shot)
         t = time.perf_counter()
         part, turn = self.part, base_from_scanner[:3, :3].T
         axis, zero = (None if v is None else (turn @ np.array(v)).tolist() for v in (part.axis_base, part.zero_base))
         try:
-            segmented = segment_weld(cloud.points_mm, part.outside_diameter / 2, part.wall_thickness, axis, zero)
+            segmented = segment_weld(scan.points_mm, part.outside_diameter / 2, part.wall_thickness, axis, zero)
         except GeometryError as error:
             self.left_out.append((shot.name, self.read.why_dark(shot) or str(error)))
             return None
         finally:
             self.read.clock("segment", t)
         self.check_radius(shot, segmented)
-        return _Weld(self.session.part_shots.index(shot), cloud.points_mm, base_from_scanner, segmented)
+        return PartView(
+            shot.name,
+            self.session.part_shots.index(shot),
+            scan.points_mm,
+            scan.reason,
+            base_from_flange(shot) if self.session.has_robot else np.eye(4),
+            base_from_scanner,
+            segmented,
+        )
 
     def check_radius(self, shot: ShotSpec, segmented: WeldShot) -> None:
         """Says where the pipe in view is not as thick as the session has it."""
         seen, told = 2 * segmented.radius_mm, self.part.outside_diameter
         if abs(seen / told - 1) > DIAMETER_WARNING:
-            self.read.warnings.append(
-                f"{shot.name}: the pipe in view measures {seen:.1f} mm across, but part.outside_diameter is {told:g} mm"
-            )
+            text = f"the pipe in view measures {seen:.1f} mm across, but part.outside_diameter is {told:g} mm"
+            self.read.findings.append(warning("description", f"{shot.name}: {text}", shot.name))
 
-    def measure(self, welds: Sequence[_Weld], hand_eye: HandEye | None) -> tuple[StepResult | None, PartCloud | None]:
+    def measure(
+        self, welds: Sequence[PartView], hand_eye: HandEye | None
+    ) -> tuple[StepResult | None, PartCloud | None]:
         """Step 7, both methods."""
         if not welds:
             return None, None
@@ -208,20 +202,22 @@ class _Run:
         self.read.clock("paper", t)
         return _step_result(step, histogram), cloud
 
-    def hold_together(self, cloud: PartCloud, welds: Sequence[_Weld], hand_eye: HandEye) -> None:
+    def hold_together(self, cloud: PartCloud, welds: Sequence[PartView], hand_eye: HandEye) -> None:
         """Shots that saw the same wall, held against each other in base."""
         shots = [(w.index, self.session.part_shots[w.index]) for w in welds]
         placed = [PlacedShot(shot.name, index, base_from_flange(shot)) for index, shot in shots]
         self.agreement = agreement(cloud, placed, hand_eye, *welds[0].axis_in_base)
-        self.read.warnings.extend(said for pair in self.agreement if (said := complaint(pair)) is not None)
+        self.read.findings.extend(
+            warning("agreement", said) for pair in self.agreement if (said := complaint(pair)) is not None
+        )
 
-    def paper(self, cloud: PartCloud, weld: _Weld) -> Histogram | None:
+    def paper(self, cloud: PartCloud, weld: PartView) -> Histogram | None:
         """The paper's chain; None with a warning where it finds no answer."""
         origin, axis = weld.axis_in_base
         try:
             return paper_step(cloud.points_mm, origin, axis, weld.shot.radius_mm)
         except GeometryError as error:
-            self.read.warnings.append(f"method paper gave no answer: {error}")
+            self.read.findings.append(note("paper", f"method paper gave no answer: {error}"))
             return None
 
     def judged(self, step: StepResult | None, cloud: PartCloud | None, hand_eye: HandEye | None) -> Inspection:
@@ -246,7 +242,7 @@ class _Run:
         scanner = self.scanner_record()
         compensated = response_record(self.response, self.read.phase_errors)
         if compensated["note"]:
-            self.read.warnings.append(compensated["note"])
+            self.read.findings.append(note("response", compensated["note"]))
         timing = self.read.timing
         timing["compute"] = sum(seconds for what, seconds in timing.items() if what != "read")
         return Inspection(
@@ -259,7 +255,7 @@ class _Run:
             cloud=cloud,
             verdicts=tuple(verdicts),
             left_out=tuple(self.left_out),
-            warnings=tuple(self.read.warnings),
+            findings=tuple(self.read.findings),
             masks=self.read.masks,
             response=compensated,
             timing_s=timing,
@@ -282,14 +278,14 @@ class _Run:
             return None
         expired = spec.valid_until is not None and date.fromisoformat(spec.valid_until) < datetime.now(UTC).date()
         if expired:
-            self.read.warnings.append(
+            text = (
                 f"the scanner's calibration {spec.id} of {(spec.date or 'an unknown day')[:10]} was valid until "
                 f"{spec.valid_until}: it is out of date"
             )
+            self.read.findings.append(warning("calibration", text))
         if spec.undetermined:
-            self.read.warnings.append(
-                f"the scanner's calibration {spec.id} did not determine {', '.join(spec.undetermined)}"
-            )
+            text = f"the scanner's calibration {spec.id} did not determine {', '.join(spec.undetermined)}"
+            self.read.findings.append(warning("calibration", text))
         return ScannerRecord(
             spec.id,
             spec.date or "",

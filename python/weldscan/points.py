@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from weldscan._weldcore import Cloud, PhaseMap, Scanner, decode, triangulate
+from weldscan._weldcore import PhaseMap, Scanner, decode, triangulate
 from weldscan.errors import InputError
-from weldscan.session import FringeSet, Session, ShotSpec, read_frames
+from weldscan.result import Finding, warning
+from weldscan.session import FringeSet, Image, Session, ShotSpec, read_frames
 
 Progress = Callable[[int, int, str], None]
 
@@ -23,13 +27,27 @@ HARMONIC_WARNING = 0.1
 MASKS = ("ok", "dark", "saturated", "order_in_doubt", "no_fit")
 
 
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One shot's pixels as points."""
+
+    points_mm: NDArray[np.float64]
+    """(H, W, 3), scanner frame, NaN where there is none."""
+    sigma_mm: NDArray[np.float32] | None
+    """(H, W): noise of each point along its ray, one sigma."""
+    reason: NDArray[np.uint8]
+    """(H, W): why a pixel has no point, as `PhaseMap.reason` says it."""
+    digest: str = ""
+    """Of the images' pixels: two shots with the same one are copies."""
+
+
 class PointReader:
     """Gives the points of a session's shots, one after the other, and keeps what is worth knowing of each.
 
     Attributes:
         timing: seconds spent per step.
         masks: per shot, how many pixels were measured, and how many not for which reason.
-        warnings: what a reader of the result should know.
+        findings: what a reader of the result should know.
         phase_errors: per shot, what was taken off the phase of each fringe set for the projector's response.
     """
 
@@ -39,10 +57,10 @@ class PointReader:
         self.axis, self.fringes, self.frames = fringe_axis(session.fringes, self.scanner)
         self.timing: dict[str, float] = {}
         self.masks: dict[str, dict[str, int]] = {}
-        self.warnings: list[str] = []
+        self.findings: list[Finding] = []
         self.phase_errors: dict[str, list[dict[str, Any]]] = {}
 
-    def __call__(self, shot: ShotSpec) -> Cloud:
+    def __call__(self, shot: ShotSpec) -> Scan:
         """The shot's points, scanner frame, on the camera's pixel grid."""
         if self.progress is not None:
             self.progress(len(self.masks), len(self.session.shots), shot.name)
@@ -65,7 +83,7 @@ class PointReader:
         cloud = triangulate(phase.column_px, self.scanner, phase.sigma_px, self.axis)
         self.clock("triangulate", t)
         self._note(shot, phase)
-        return cloud
+        return Scan(cloud.points_mm, cloud.sigma_mm, phase.reason, digest(exposures))
 
     def clock(self, what: str, since: float) -> float:
         """Adds the time since then to a step; returns now."""
@@ -77,9 +95,13 @@ class PointReader:
         self.masks[shot.name] = dict(zip(MASKS, map(int, phase.counts), strict=True))
         worst = max((h for h in phase.harmonics if h is not None), default=0.0)
         if worst > HARMONIC_WARNING and phase.counts[0] > 0 and self.compensate == "off":
-            self.warnings.append(
-                f"{shot.name}: the fringes are not sinusoidal (harmonics {100 * worst:.0f} % of their amplitude) and "
-                "nothing was done about it: the projector's response should be corrected"
+            self.findings.append(
+                warning(
+                    "response",
+                    f"{shot.name}: the fringes are not sinusoidal (harmonics {100 * worst:.0f} % of their amplitude) "
+                    "and nothing was done about it: the projector's response should be corrected",
+                    shot.name,
+                )
             )
         self.phase_errors[shot.name] = [
             {
@@ -103,6 +125,19 @@ class PointReader:
         reasons = sorted(((n, name) for name, n in counts.items() if name != "ok" and n), reverse=True)
         shares = ", ".join(f"{100 * n / total:.0f} % {name.replace('_', ' ')}" for n, name in reasons)
         return f"hardly any fringes in view: {counts['ok']} of {total} pixels were measured ({shares})"
+
+
+# Every so many rows of an image: no two captures have the same noise in any of them.
+DIGEST_ROWS = 16
+
+
+def digest(exposures: Sequence[Sequence[Image]]) -> str:
+    """A hash of a shot's pixels, whatever their files were called or how they were packed."""
+    found = hashlib.sha256()
+    for stack in exposures:
+        for image in stack:
+            found.update(np.ascontiguousarray(image[::DIGEST_ROWS]).tobytes())
+    return found.hexdigest()
 
 
 def fringe_axis(fringes: Sequence[FringeSet], scanner: Scanner) -> tuple[str, list[FringeSet], list[int]]:

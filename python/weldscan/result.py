@@ -33,6 +33,116 @@ class Label(IntEnum):
     BEAD = 3
 
 
+class Severity(StrEnum):
+    """How much a finding weighs."""
+
+    NOTE = "note"
+    """Worth knowing; changes nothing."""
+    WARNING = "warning"
+    """Something is not as it should be; the verdict stands."""
+    BAR = "bar"
+    """The verdict cannot be relied on as a PASS: PASS becomes INCONCLUSIVE, every other verdict stays."""
+
+
+CODES = {
+    "agreement": "shots placed in base disagree by less than what bars, more than their uncertainty",
+    "calibration": "the scanner's calibration: not stated, out of date, or not determined by its poses",
+    "cap": "what lies between the walls is not one cap of a weld: too wide, two-humped, toes that jump, two seams",
+    "clipped": "the camera clips below its full scale",
+    "coverage": "less of the seam was seen than is required",
+    "description": "the scan contradicts what the session says of the part",
+    "edges": "the surfaces right beside the toes contradict the walls' step, or could not be read",
+    "frames-disagree": "the frames of one shot contradict each other: copied, exchanged, out of order, moved",
+    "hand-eye": "the hand-eye calibration contradicts where the part is found, or is poor",
+    "paper": "the paper's method gave no answer",
+    "points-without-wall": "points beside the seam that neither wall nor cap explains",
+    "pose": "a flange pose is out of the robot's reach, or contradicts the others",
+    "response": "the projector's response",
+    "saturation": "too much of the seam's surroundings is saturated",
+    "shot-altered": "files of a shot differ from what was recorded, or its description does",
+    "shot-copied": "two shots hold the same images",
+    "shot-left-out": "a shot of the part could not be used",
+    "shot-missing": "a planned shot is not there",
+    "shots-disagree": "two shots contradict each other",
+    "transition": "between wall and cap lies more than weld shrinkage explains",
+    "verification": "what is on record about the scanner's verification",
+    "walls": "the walls are not what a pipe's are, or only partly seen",
+}
+"""Every code that a finding may have, and what it is about."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What there is to say of an inspection, in one line."""
+
+    severity: Severity
+    code: str
+    """One of `CODES`."""
+    text: str
+    shot: str | None = None
+    """The shot that it is about."""
+    at_deg: float | None = None
+    """Where on the seam."""
+
+    def __post_init__(self) -> None:
+        if self.code not in CODES:
+            raise ValueError(f"{self.code!r} is no code of a finding")
+
+
+def bar(code: str, text: str, shot: str | None = None, at_deg: float | None = None) -> Finding:
+    """A finding that bars PASS."""
+    return Finding(Severity.BAR, code, text, shot, at_deg)
+
+
+def warning(code: str, text: str, shot: str | None = None, at_deg: float | None = None) -> Finding:
+    """A finding that the verdict stands in spite of."""
+    return Finding(Severity.WARNING, code, text, shot, at_deg)
+
+
+def note(code: str, text: str, shot: str | None = None, at_deg: float | None = None) -> Finding:
+    """A finding that is only worth knowing."""
+    return Finding(Severity.NOTE, code, text, shot, at_deg)
+
+
+FATES = (
+    *("wall", "transition", "cap", "gated", "off_line", "dark", "saturated", "order_in_doubt", "two_paths"),
+    *("outside_calibration", "hidden", "other"),
+)
+"""What became of a pixel of a part shot, by contract."""
+
+
+@dataclass(frozen=True)
+class SeamBin:
+    """One bin of the seam that was required or seen, and what became of every pixel in it."""
+
+    angle_deg: float
+    along_mm: float
+    """From the zero mark along the seam."""
+    measured: bool
+    fate: dict[str, int]
+    """Pixels by `FATES`, over all part shots."""
+    cap_width_mm: float | None = None
+    toes_mm: tuple[float, float] | None = None
+    """Both toes, along the axis from the seam's centreline: reference side, other side."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How much of the seam was seen, and how much had to be."""
+
+    seen_deg: float
+    required_deg: float
+    required_by: str
+    """session, option, or views: what these views should have seen."""
+    gaps: tuple[tuple[float, float], ...]
+    """Arcs that were required and not seen, from, to, degrees, in the direction of growing angle."""
+
+    @property
+    def enough(self) -> bool:
+        """Whether all that is required was seen."""
+        return not self.gaps and self.seen_deg >= self.required_deg
+
+
 @dataclass(frozen=True)
 class Judgement:
     """One verdict under one clause of one norm."""
@@ -249,11 +359,17 @@ class Inspection:
     verdicts: tuple[Judgement, ...]
     left_out: tuple[tuple[str, str], ...]
     """Shots that could not be used, with the reason."""
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    """Notes, warnings and bars."""
     masks: dict[str, dict[str, int]]
     """Per shot: how many pixels were ok, dark, saturated, in doubt of their fringe order, without a fit."""
     timing_s: dict[str, float]
     software: dict[str, str]
+    seam: tuple[SeamBin, ...] = ()
+    """Every bin of the seam that was required or seen."""
+    coverage: Coverage | None = None
+    calibration: str = "not stated"
+    """`stated` where U holds the scanner's calibration, else `not stated`."""
     verification: Standing | None = None
     """What is on record about the scanner."""
     agreement: tuple[ShotAgreement, ...] = ()
@@ -263,6 +379,16 @@ class Inspection:
     response: dict[str, Any] = field(default_factory=dict)
     """What was done about the projector's response: `mode` (auto, off, table), `compensated` shots, `largest_rad`, and
     per shot and fringe set the series that was taken off the phase."""
+
+    @property
+    def bars(self) -> tuple[Finding, ...]:
+        """What bars PASS."""
+        return tuple(finding for finding in self.findings if finding.severity is Severity.BAR)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The text of the findings that do not bar."""
+        return tuple(finding.text for finding in self.findings if finding.severity is not Severity.BAR)
 
     @property
     def judged_mm(self) -> float | None:

@@ -47,7 +47,7 @@ from weldscan.calibration.hand_eye_model import (
 from weldscan.errors import GeometryError, InputError, NotMeasured
 from weldscan.points import PointReader, Progress
 from weldscan.pose import matrix_from_kuka
-from weldscan.result import ArtefactShot, HandEye, SphereFit
+from weldscan.result import ArtefactShot, HandEye, SphereFit, warning
 from weldscan.session import HandEyeSpec, Session, ShotSpec, read_session, write_hand_eye
 
 __all__ = ["calibrate", "hand_eye_of", "point_uncertainty_mm", "solve_hand_eye", "write_hand_eye"]
@@ -568,7 +568,9 @@ def hand_eye_of(read: PointReader, left_out: list[tuple[str, str]]) -> HandEye |
     session: Session = read.session
     if isinstance(session.hand_eye, HandEyeSpec):
         if not np.any(session.hand_eye.covariance):
-            read.warnings.append("hand_eye.covariance: is zero, so U holds nothing of the hand-eye")
+            read.findings.append(
+                warning("hand-eye", "hand_eye.covariance: is zero, so U holds nothing of the hand-eye")
+            )
         return _kept(session.hand_eye)
     if session.artefact is None or not session.artefact_shots:
         return None
@@ -622,7 +624,7 @@ def hand_eye_of(read: PointReader, left_out: list[tuple[str, str]]) -> HandEye |
     except (InputError, GeometryError) as error:
         raise InputError(f"{where}: shots: {error}") from None
     left_out.extend((shot.shot, shot.outlier) for shot in solved.per_shot if shot.outlier is not None)
-    read.warnings.extend(f"hand-eye: {warning}" for warning in solved.warnings)
+    read.findings.extend(warning("hand-eye", f"hand-eye: {text}") for text in solved.warnings)
     read.clock("hand_eye", t)
     return solved
 

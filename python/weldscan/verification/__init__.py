@@ -32,7 +32,7 @@ from weldscan.calibration.hand_eye import base_from_flange
 from weldscan.errors import GeometryError, InputError
 from weldscan.manifest import left_out, read_manifest
 from weldscan.points import PointReader, Progress
-from weldscan.result import BallError, Characteristic, PlaneError, SpacingError, Verdict, Verification
+from weldscan.result import BallError, Characteristic, PlaneError, SpacingError, Verdict, Verification, warning
 from weldscan.session import ScannerSpec, Session, read_session
 from weldscan.verification.form import FormError, flatness_error, noise_range, probing_error
 from weldscan.verification.limits import VerificationLimits, limits_from, read_limits
@@ -289,9 +289,8 @@ def verify(
     characteristics, assumed = _characteristics(session, kept, balls, spacings, planes, lost)
     short = min((plane.of_field for plane in planes), default=1.0)
     if short < HALF_FIELD:
-        read.warnings.append(
-            f"a plane spans {100 * short:.0f} % of the field's diagonal: VDI/VDE 2634-2 asks for half (unverified)"
-        )
+        text = f"a plane spans {100 * short:.0f} % of the field's diagonal: VDI/VDE 2634-2 asks for half (unverified)"
+        read.findings.append(warning("verification", text))
     valid_until = recorded + timedelta(days=kept.validity_days)
     return Verification(
         session=session.name,
@@ -305,7 +304,7 @@ def verify(
         planes=tuple(planes),
         lost=tuple(lost.items()),
         assumed=assumed,
-        warnings=tuple(read.warnings),
+        warnings=tuple(finding.text for finding in read.findings),
         limits=kept.model_dump(exclude={"history"}),
         fringes=fringes_of(session),
         software={

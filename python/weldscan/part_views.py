@@ -1,0 +1,36 @@
+"""What one shot saw of the part, placed and segmented: what every check of an inspection looks at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldscan._weldcore import WeldShot
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PartView:
+    """One segmented part shot."""
+
+    name: str
+    index: int
+    """Among the session's part shots."""
+    points_mm: Floats
+    """(H, W, 3), scanner frame, NaN where there is none."""
+    reason: NDArray[np.uint8]
+    """(H, W): why a pixel has no point, as `PhaseMap.reason` says it."""
+    base_from_flange: Floats
+    """(4, 4); the identity without a robot."""
+    base_from_scanner: Floats
+    """(4, 4); the identity without a robot."""
+    shot: WeldShot
+
+    @property
+    def axis_in_base(self) -> tuple[Floats, Floats]:
+        """A point of the pipe's axis, at the seam's centreline, and its direction."""
+        turn, shift = self.base_from_scanner[:3, :3], self.base_from_scanner[:3, 3]
+        return turn @ self.shot.origin_mm + shift, turn @ self.shot.axis

@@ -1,21 +1,33 @@
-"""Part shots held against each other: what two of them saw of the same wall must be in the same place in base.
+"""Part shots held against each other, before their walls are pooled: they are of one pipe, and it stood still.
 
-The step does not depend on it, for each shot has its own reference wall. What is placed through the robot does: cloud,
-angles, the paper's number, a comparison with probed points. A part that was moved, or a wrong flange pose, shows here.
+- `copies`: no two shots hold the same images.
+- `shots_agree`: each shot alone tells the pipe's axis, the place of the seam along it and the step by angle. Exchanged
+  images, a wrong flange pose, a hand-eye of another cell show in the first two whether or not the shots saw the same
+  arc; two pipes, or a wall misread in one of them, in the third.
+- `agreement`: what two shots saw of the same wall must be in the same place in base. The step does not depend on
+  small disagreements of that kind, for each shot has its own reference wall. What is placed through the robot does:
+  cloud, angles, the paper's number, a comparison with probed points.
+
+What a real pipe does is no disagreement. One that is out of round moves a locally fitted axis sideways by millimetres,
+and only there; where the seam is along the pipe, and to where the pipe runs, it leaves alone.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan.calibration.hand_eye import pose_sigma
+from weldscan._weldcore import measure_step
+from weldscan.calibration.hand_eye import LARGEST_RESIDUAL_MM, pose_sigma
 from weldscan.calibration.hand_eye_model import skew
-from weldscan.result import HandEye, Label, PartCloud, ShotAgreement
+from weldscan.errors import GeometryError
+from weldscan.part_views import PartView
+from weldscan.result import Finding, HandEye, Label, PartCloud, Severity, ShotAgreement, bar, warning
 
 Floats = NDArray[np.float64]
 
@@ -26,6 +38,36 @@ LEAST_POINTS, LEAST_CELLS = 5, 20
 POINTS = 150_000
 # Neighbouring cells share the scanner's errors: about so many count as one.
 CORRELATED_CELLS = 4
+# Two shots, each placed as wrong as no industrial arm stands.
+LARGEST_DIFFERENCE_MM = 2 * LARGEST_RESIDUAL_MM
+
+# --- where the pipe is, as one shot alone tells it
+# A wall's own direction: the weld draws both in by half a millimetre over a decimetre (1 sigma; a drawn-in wall leans
+# by 0.3 degrees), and a pipe is straight to 0.2 % of its length.
+WALL_LEAN_RAD = math.radians(0.2)
+# Waves of a wall that a fitted cylinder follows.
+UNEVENNESS_MM = 0.05
+# How far a pipe's cut end may be from square (API 5L, 9.12.5.5), and how far the middle between two toes may be from
+# it in parts of the cap's width: a cap is as much wider on one side.
+SQUARENESS_MM = 1.6
+CAP_PART = 0.2
+# An out-of-roundness of 2 % of the diameter moves the centre of a local circle by up to 1.5 % of it, to either side.
+OVAL_PART = 0.03
+# Over this angle between two views the form of the pipe is another one.
+OVAL_TURN_RAD = math.radians(45)
+SIGMAS = 3.0
+
+# --- the step, as one shot alone tells it
+# What two places of the scanner's field read differently: calibrations of one scanner differ by 0.15 mm (rms) in the
+# step. A real disagreement of two pipes, or of a wall misread, matters from there on.
+STEP_SLACK_MM = 0.2
+# Below that, from here on, it is worth a warning: waves of the walls.
+STEP_WARNING_MM = 0.1
+# A bin may be this many degrees off: an oval pipe moves the centre about which a shot counts angles.
+STEP_SHIFT_DEG = 2
+LEAST_BINS = 2
+# So many disagreements are listed; more only repeat them.
+MOST_SAID = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,15 +126,244 @@ def agreement(
     return tuple(found)
 
 
-def complaint(pair: ShotAgreement) -> str | None:
-    """What to say of two shots that disagree by more than their uncertainty."""
-    if abs(pair.difference_mm) <= pair.expanded_uncertainty_mm:
+def complaint(pair: ShotAgreement) -> Finding | None:
+    """What to say of two shots that disagree by more than their uncertainty: a warning, or a bar where it is large."""
+    off, u = abs(pair.difference_mm), pair.expanded_uncertainty_mm
+    if off <= u:
         return None
-    return (
-        f"{pair.shots[0]} and {pair.shots[1]} disagree by {abs(pair.difference_mm):.3f} mm where both saw the wall, "
-        f"more than U = {pair.expanded_uncertainty_mm:.3f} mm: was the part moved, or is a flange pose wrong? Cloud, "
-        "angles and the paper's number are placed through them; the step is not"
+    one, other = pair.shots
+    text = f"{one} and {other} disagree by {off:.3f} mm where both saw the wall, more than U = {u:.3f} mm: "
+    if off > LARGEST_DIFFERENCE_MM + u:
+        return bar(
+            "shots-disagree",
+            f"{text}no robot stands so wrong: was the part moved, were images exchanged, is a flange pose wrong?",
+            other,
+        )
+    return warning(
+        "agreement",
+        f"{text}was the part moved, or is a flange pose wrong? Cloud, angles and the paper's number are placed through "
+        "them; the step is not",
     )
+
+
+# --- copies -----------------------------------------------------------------------------------------------------------
+
+
+def copies(digests: Mapping[str, str]) -> list[Finding]:
+    """A bar for every shot whose images are another's.
+
+    Args:
+        digests: per shot, of whatever kind, the hash of its images.
+
+    >>> [finding.text for finding in copies({"part-1": "a", "part-2": "b", "part-3": "a"})]
+    ['part-3 holds the same images as part-1: no two captures are alike; scan the one that is not there again']
+    """
+    first: dict[str, str] = {}
+    return [
+        bar(
+            "shot-copied",
+            f"{name} holds the same images as {twin}: no two captures are alike; scan the one that is not there again",
+            name,
+        )
+        for name, digest in digests.items()
+        if (twin := first.setdefault(digest, name)) != name
+    ]
+
+
+# --- the pipe and the step, shot by shot ------------------------------------------------------------------------------
+
+
+def shots_agree(views: Sequence[PartView], hand_eye: HandEye) -> list[Finding]:
+    """Whether the shots are of one pipe that stood still.
+
+    Args:
+        views: the segmented part shots.
+        hand_eye: through which they were placed.
+
+    Returns:
+        Bars `shots-disagree`, each naming two shots (or the one that contradicts all others) with their numbers, and
+        warnings `agreement`.
+    """
+    return [*_placed_alike(views, hand_eye), *_stepped_alike(views, hand_eye)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """The pipe as one shot has it, base."""
+
+    view: PartView
+    axis: Floats
+    seam_mm: Floats
+    """(3,) on the surface, at the seam, in the middle of the arc."""
+    outward: Floats
+    """There, unit, square to the axis."""
+    direction_cov: Floats
+    """(3, 3), rad^2, of the axis' direction, without the robot's."""
+    centre_gain: float
+    """How many times a wave of the wall moves the circle's centre: 1 / (1 - cos) of half the arc."""
+
+    @classmethod
+    def of(cls, view: PartView) -> _Seen:
+        shot, turn = view.shot, view.base_from_scanner[:3, :3]
+        origin, axis = view.axis_in_base
+        wall = np.flatnonzero(shot.labels == Label.REFERENCE_WALL)
+        wall = wall[:: max(1, len(wall) // 20_000)]
+        angle, along = shot.angle_rad[wall].astype(np.float64), shot.axial_mm[wall].astype(np.float64)
+        middle = math.atan2(float(np.sin(angle).mean()), float(np.cos(angle).mean()))
+        zero = turn @ shot.zero
+        zero = zero - axis * (axis @ zero)
+        zero /= np.linalg.norm(zero)
+        outward = math.cos(middle) * zero + math.sin(middle) * np.cross(axis, zero)
+        across = np.cross(axis, outward)
+        # The axis leans towards the view, or turns across it: then the wall is twisted by along * sin(angle) only.
+        twist = float(np.std((along - along.mean()) * np.sin(angle - middle)))
+        towards = WALL_LEAN_RAD
+        sideways = math.hypot(WALL_LEAN_RAD, UNEVENNESS_MM / max(twist, 1e-3))
+        covariance = towards**2 * np.outer(outward, outward) + sideways**2 * np.outer(across, across)
+        half = float(np.quantile(np.abs(np.angle(np.exp(1j * (angle - middle)))), 0.98))
+        gain = 1 / max(1 - math.cos(half), 1e-4)
+        return cls(view, axis, origin + shot.radius_mm * outward, outward, covariance, gain)
+
+
+def _placed_alike(views: Sequence[PartView], hand_eye: HandEye) -> list[Finding]:
+    seen = [_Seen.of(view) for view in views]
+    said = {
+        (i, j): complaints
+        for i, j in combinations(range(len(seen)), 2)
+        if (complaints := list(_misplaced(seen[i], seen[j], hand_eye)))
+    }
+    # One shot that contradicts all the others is named alone, where there are others that agree.
+    for k, view in enumerate(views):
+        with_it = [pair for pair in said if k in pair]
+        if len(views) > 2 and len(with_it) == len(views) - 1 == len(said):
+            other = next(i for i in with_it[0] if i != k)
+            return [
+                bar(
+                    "shots-disagree",
+                    f"{view.name} contradicts all other shots, which agree: against {views[other].name} "
+                    f"{'; '.join(said[with_it[0]])}: is its flange pose wrong, are its images another shot's, was the "
+                    "part moved?",
+                    view.name,
+                )
+            ]
+    most = len(said) == len(seen) * (len(seen) - 1) // 2 and len(seen) > 2
+    likely = (
+        "all shots contradict each other: is the hand-eye of this cell, are A, B, C in degrees?"
+        if most
+        else "were their images exchanged, is a flange pose wrong, was the part moved, is the hand-eye of another cell?"
+    )
+    found = [
+        bar(
+            "shots-disagree",
+            f"{views[i].name} and {views[j].name} contradict each other: {'; '.join(complaints)}: {likely}",
+            views[j].name,
+        )
+        for (i, j), complaints in said.items()
+    ]
+    return found[:MOST_SAID]
+
+
+def _misplaced(one: _Seen, other: _Seen, hand_eye: HandEye) -> Iterator[str]:
+    """What two shots say differently of where the pipe is, beyond what a real pipe and a real robot do."""
+    axis = one.axis + other.axis
+    axis /= np.linalg.norm(axis)
+    shots = [PlacedShot(s.view.name, s.view.index, s.view.base_from_flange) for s in (one, other)]
+    middle = (one.seam_mm + other.seam_mm) / 2
+    turned = np.eye(3) * _turning_rad(hand_eye) ** 2
+    # To where it runs.
+    apart = other.axis - one.axis
+    covariance = one.direction_cov + other.direction_cov + turned
+    if float(apart @ np.linalg.solve(covariance, apart)) > SIGMAS**2:
+        allowed = SIGMAS * math.degrees(math.sqrt(float(apart @ covariance @ apart) / float(apart @ apart)))
+        yield f"its axis differs by {math.degrees(np.linalg.norm(apart)):.2f} degrees ({allowed:.2f} at most)"
+    # Where the seam is along it. Over the distance across, what is not known of the direction counts as well.
+    between = other.seam_mm - one.seam_mm
+    across = between - axis * (axis @ between)
+    along = float(axis @ between)
+    direction = float(across @ (one.direction_cov + other.direction_cov + turned) @ across) / 4
+    sigma = math.sqrt(_placing_mm(shots, hand_eye, middle, axis) ** 2 + direction)
+    width = max(one.view.shot.bead_width_mm, other.view.shot.bead_width_mm)
+    allowed = SQUARENESS_MM + CAP_PART * width + SIGMAS * sigma
+    if abs(along) > allowed:
+        yield f"the seam is {abs(along):.1f} mm apart along the pipe ({allowed:.1f} at most)"
+    # Where the axis is. The radii of two views of one place are one pipe's; of two places they need not be.
+    off = across - (other.view.shot.radius_mm * other.outward - one.view.shot.radius_mm * one.outward)
+    off -= axis * (axis @ off)
+    turn = math.acos(max(-1.0, min(1.0, float(one.outward @ other.outward))))
+    radius = (one.view.shot.radius_mm + other.view.shot.radius_mm) / 2
+    oval = OVAL_PART * 2 * radius * min(1.0, turn / OVAL_TURN_RAD)
+    size = float(np.linalg.norm(off))
+    placing = _placing_mm(shots, hand_eye, middle, off / size) if size > 0 else 0.0
+    arc = UNEVENNESS_MM * (one.centre_gain + other.centre_gain)
+    allowed = LARGEST_DIFFERENCE_MM + oval + SIGMAS * math.hypot(placing, arc)
+    if size > allowed:
+        yield f"its axis is {size:.1f} mm aside ({allowed:.1f} at most)"
+
+
+def _turning_rad(hand_eye: HandEye) -> float:
+    """How far two placed directions may be turned against each other, each axis: two poses, and the hand-eye twice."""
+    common = float(np.linalg.eigvalsh(hand_eye.covariance[:3, :3]).max())
+    return math.sqrt(2 * pose_sigma(hand_eye)[1] ** 2 + 4 * max(common, 0.0))
+
+
+def _stepped_alike(views: Sequence[PartView], hand_eye: HandEye) -> list[Finding]:
+    """The step of each shot alone, bin by bin, on the arcs that two of them saw."""
+    degrees = [_bins_seen(view) for view in views]
+    pairs = [(i, j) for i, j in combinations(range(len(views)), 2) if len(degrees[i] & degrees[j]) >= LEAST_BINS]
+    alone: dict[int, dict[int, tuple[float, float]]] = {}
+    for k in sorted({k for pair in pairs for k in pair}):
+        try:
+            step = measure_step([views[k].shot], angle_sigma_rad=_turning_rad(hand_eye))
+        except GeometryError:
+            continue
+        columns = step["profile_columns"]
+        angle, value, sigma = (columns.index(name) for name in ("angle_deg", "step_mm", "standard_mm"))
+        alone[k] = {round(row[angle]) % 360: (float(row[value]), float(row[sigma])) for row in step["profile"]}
+    found = []
+    for i, j in pairs:
+        if i in alone and j in alone:
+            found += list(_unlike(views[i].name, views[j].name, alone[i], alone[j]))
+    return sorted(found, key=lambda finding: finding.severity is not Severity.BAR)[:MOST_SAID]
+
+
+def _bins_seen(view: PartView) -> set[int]:
+    walls = (view.shot.labels == Label.REFERENCE_WALL) | (view.shot.labels == Label.OTHER_WALL)
+    angle = np.degrees(view.shot.angle_rad[walls][::50])
+    return set((2 * np.rint(angle / 2) % 360).astype(int).tolist())
+
+
+def _unlike(
+    one: str, other: str, a: Mapping[int, tuple[float, float]], b: Mapping[int, tuple[float, float]]
+) -> Iterator[Finding]:
+    """Where two profiles differ by more than their uncertainty in bins beside each other."""
+    excess = {}
+    for at, (step, sigma) in a.items():
+        near = [b[turn] for d in range(-STEP_SHIFT_DEG, STEP_SHIFT_DEG + 1, 2) if (turn := (at + d) % 360) in b]
+        if at in b:
+            low, high = min(h for h, _ in near), max(h for h, _ in near)
+            off = max(0.0, low - step, step - high)
+            excess[at] = off - SIGMAS * math.hypot(sigma, b[at][1])
+    for slack, severe in ((STEP_SLACK_MM, True), (STEP_WARNING_MM, False)):
+        beyond = {at for at, off in excess.items() if off > slack}
+        worst = max((at for at in beyond if (at + 2) % 360 in beyond or (at - 2) % 360 in beyond), default=None,
+                    key=lambda at: excess[at])  # fmt: skip
+        if worst is None:
+            continue
+        (h, u), (g, v) = a[worst], b[worst]
+        text = (
+            f"{one} and {other} contradict each other on the step where both saw the seam: at {worst} degrees "
+            f"{h:.3f} ± {2 * u:.3f} mm in {one}, {g:.3f} ± {2 * v:.3f} mm in {other}, in {len(beyond)} bins"
+        )
+        if severe:
+            yield bar(
+                "shots-disagree", f"{text}: are they of one weld, was a wall misread in one?", other, float(worst)
+            )
+        else:
+            yield warning("agreement", text, other, float(worst))
+        return
+
+
+# --- the same wall ----------------------------------------------------------------------------------------------------
 
 
 def _cells(

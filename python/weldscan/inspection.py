@@ -16,16 +16,17 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import WeldShot, __version__, measure_step, place_shots, segment_weld
-from weldscan.agreement import PlacedShot, agreement, complaint
+from weldscan._weldcore import __version__, measure_step, place_shots, segment_weld
+from weldscan.agreement import PlacedShot, agreement, complaint, copies, shots_agree
 from weldscan.calibration.hand_eye import (
     base_from_flange,
     hand_eye_of,
     point_uncertainty_mm,
     pose_sigma,
 )
+from weldscan.description import held_against_itself, held_against_record, held_against_scan, not_used, other_part
 from weldscan.errors import GeometryError, InputError
-from weldscan.manifest import left_out as left_out_of
+from weldscan.manifest import faults as faults_of
 from weldscan.norms import judge, load_norm
 from weldscan.paper_method import paper_step
 from weldscan.part_views import PartView
@@ -49,8 +50,6 @@ from weldscan.verification.history import standing_of
 Floats = NDArray[np.float64]
 DEFAULT_NORMS = ("pnae-g-7-010-89",)
 METHODS = ("surface", "paper")
-# The usual delivery tolerance of a pipe's diameter, and its ovality: beyond twice that the session is asked about.
-DIAMETER_WARNING = 0.02
 
 
 def inspect(
@@ -130,7 +129,9 @@ class _Run:
         self.response = response
         self.read = PointReader(self.session, progress, _compensation(response))
         self.agreement: tuple[ShotAgreement, ...] = ()
-        self.left_out: list[tuple[str, str]] = list(left_out_of(self.session.folder))
+        faults = faults_of(self.session.folder)
+        self.left_out: list[tuple[str, str]] = [(fault.shot, fault.reason) for fault in faults]
+        self.read.findings += held_against_itself(self.session) + held_against_record(self.session, faults)
         unusable = {name for name, _ in self.left_out}
         self.part_shots = [shot for shot in self.session.part_shots if shot.name not in unusable]
 
@@ -149,11 +150,14 @@ class _Run:
         try:
             segmented = segment_weld(scan.points_mm, part.outside_diameter / 2, part.wall_thickness, axis, zero)
         except GeometryError as error:
-            self.left_out.append((shot.name, self.read.why_dark(shot) or str(error)))
+            why = self.read.why_dark(shot) or other_part(scan.points_mm, part) or str(error)
+            self.left_out.append((shot.name, why))
             return None
         finally:
             self.read.clock("segment", t)
-        self.check_radius(shot, segmented)
+        if (other := other_part(scan.points_mm, part, segmented)) is not None:
+            self.left_out.append((shot.name, other))
+            return None
         return PartView(
             shot.name,
             self.session.part_shots.index(shot),
@@ -164,19 +168,13 @@ class _Run:
             segmented,
         )
 
-    def check_radius(self, shot: ShotSpec, segmented: WeldShot) -> None:
-        """Says where the pipe in view is not as thick as the session has it."""
-        seen, told = 2 * segmented.radius_mm, self.part.outside_diameter
-        if abs(seen / told - 1) > DIAMETER_WARNING:
-            text = f"the pipe in view measures {seen:.1f} mm across, but part.outside_diameter is {told:g} mm"
-            self.read.findings.append(warning("description", f"{shot.name}: {text}", shot.name))
-
     def measure(
         self, welds: Sequence[PartView], hand_eye: HandEye | None
     ) -> tuple[StepResult | None, PartCloud | None]:
         """Step 7, both methods."""
         if not welds:
             return None, None
+        self.read.findings += held_against_scan(self.session, welds, hand_eye)
         t = time.perf_counter()
         angle_sigma = 0.0
         if hand_eye is not None:
@@ -207,9 +205,8 @@ class _Run:
         shots = [(w.index, self.session.part_shots[w.index]) for w in welds]
         placed = [PlacedShot(shot.name, index, base_from_flange(shot)) for index, shot in shots]
         self.agreement = agreement(cloud, placed, hand_eye, *welds[0].axis_in_base)
-        self.read.findings.extend(
-            warning("agreement", said) for pair in self.agreement if (said := complaint(pair)) is not None
-        )
+        self.read.findings += [said for pair in self.agreement if (said := complaint(pair)) is not None]
+        self.read.findings += shots_agree(welds, hand_eye)
 
     def paper(self, cloud: PartCloud, weld: PartView) -> Histogram | None:
         """The paper's chain; None with a warning where it finds no answer."""
@@ -222,6 +219,8 @@ class _Run:
 
     def judged(self, step: StepResult | None, cloud: PartCloud | None, hand_eye: HandEye | None) -> Inspection:
         """Step 8, and everything together."""
+        self.read.findings += copies(self.read.digests)
+        self.read.findings += not_used(self.session, self.left_out, self.read.findings)
         value, expanded, coverage = None, None, None
         if step is not None:
             value, expanded, coverage = step.max_abs_mm, step.expanded_uncertainty_mm, step.coverage_deg

@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -53,31 +54,53 @@ def read_manifest(folder: Path) -> ShotManifest:
     return manifest
 
 
-def left_out(folder: str | os.PathLike[str]) -> tuple[tuple[str, str], ...]:
-    """Return the shots of a session folder that an inspection cannot use, each with the reason.
+@dataclass(frozen=True)
+class Fault:
+    """A shot of a scan that is not as it was taken."""
 
-    Those whose files are not what their manifest says, and those that the plan has and the session has not. Empty for a
+    shot: str
+    code: str
+    """`shot-altered` or `shot-missing`, of `weldscan.result.CODES`."""
+    reason: str
+
+
+def faults(folder: str | os.PathLike[str]) -> tuple[Fault, ...]:
+    """Return what is wrong with the shots of a session folder, each once, with the reason.
+
+    Those whose files are not what their manifest says, and those that the plan has and the folder has not. Empty for a
     session that no scan wrote.
 
     Args:
         folder: the session's folder.
+
+    Raises:
+        InputError: the plan cannot be read.
     """
     folder = Path(folder)
-    reasons: dict[str, str] = {}
+    found: dict[str, Fault] = {}
     shots = folder / "shots"
     for manifest in sorted(shots.glob(f"*/{SHOT}")) if shots.is_dir() else ():
-        if manifest.parent.name.startswith("."):
+        name = manifest.parent.name
+        if name.startswith("."):
             continue
         try:
             read_manifest(manifest.parent)
         except InputError as error:
-            reasons[manifest.parent.name] = str(error)
-    for name in _planned(folder):
+            found[name] = Fault(name, "shot-altered", str(error))
+    plan = planned(folder)
+    for name in () if plan is None else (shot.name for shot in plan.shots):
         if not (shots / name).is_dir():
-            reasons.setdefault(name, "planned, but not scanned: weldscan scan --resume goes on")
+            reason = "planned, but not scanned: weldscan scan --resume goes on"
+            found.setdefault(name, Fault(name, "shot-missing", reason))
         elif not (shots / name / SHOT).is_file():
-            reasons.setdefault(name, f"its {SHOT} is missing, so nobody knows whether it is whole")
-    return tuple(reasons.items())
+            reason = f"its {SHOT} is missing, so nobody knows whether it is whole"
+            found.setdefault(name, Fault(name, "shot-altered", reason))
+    return tuple(found.values())
+
+
+def left_out(folder: str | os.PathLike[str]) -> tuple[tuple[str, str], ...]:
+    """Return the shots of a session folder that an inspection cannot use, each with the reason: see `faults`."""
+    return tuple((fault.shot, fault.reason) for fault in faults(folder))
 
 
 def read_plan(path: Path) -> Session:
@@ -85,11 +108,10 @@ def read_plan(path: Path) -> Session:
     return parse_session(path)
 
 
-def _planned(folder: Path) -> list[str]:
+def planned(folder: Path) -> Session | None:
+    """Return the plan that a session folder was scanned by; None where no scan wrote it."""
     path = folder / PLAN
-    if not path.is_file():
-        return []
-    return [shot.name for shot in read_plan(path).shots]
+    return read_plan(path) if path.is_file() else None
 
 
 # --- writing that survives a power cut --------------------------------------------------------------------------------

@@ -49,6 +49,7 @@ class PointReader:
         masks: per shot, how many pixels were measured, and how many not for which reason.
         findings: what a reader of the result should know.
         phase_errors: per shot, what was taken off the phase of each fringe set for the projector's response.
+        digests: per shot, the hash of its images.
     """
 
     def __init__(self, session: Session, progress: Progress | None = None, compensate: Compensate = "auto") -> None:
@@ -59,6 +60,7 @@ class PointReader:
         self.masks: dict[str, dict[str, int]] = {}
         self.findings: list[Finding] = []
         self.phase_errors: dict[str, list[dict[str, Any]]] = {}
+        self.digests: dict[str, str] = {}
 
     def __call__(self, shot: ShotSpec) -> Scan:
         """The shot's points, scanner frame, on the camera's pixel grid."""
@@ -83,7 +85,8 @@ class PointReader:
         cloud = triangulate(phase.column_px, self.scanner, phase.sigma_px, self.axis)
         self.clock("triangulate", t)
         self._note(shot, phase)
-        return Scan(cloud.points_mm, cloud.sigma_mm, phase.reason, digest(exposures))
+        self.digests[shot.name] = digest(exposures)
+        return Scan(cloud.points_mm, cloud.sigma_mm, phase.reason, self.digests[shot.name])
 
     def clock(self, what: str, since: float) -> float:
         """Adds the time since then to a step; returns now."""

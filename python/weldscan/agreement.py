@@ -42,13 +42,16 @@ CORRELATED_CELLS = 4
 LARGEST_DIFFERENCE_MM = 2 * LARGEST_RESIDUAL_MM
 
 # --- where the pipe is, as one shot alone tells it
-# A wall's own direction: the weld draws both in by half a millimetre over a decimetre (1 sigma; a drawn-in wall leans
-# by 0.3 degrees), and a pipe is straight to 0.2 % of its length.
-WALL_LEAN_RAD = math.radians(0.2)
-# Waves of a wall that a fitted cylinder follows.
-UNEVENNESS_MM = 0.05
+# A wall's own direction, 1 sigma: the weld draws both walls in by 0.2 mm over some 2.5 sqrt(R t), a decimetre (half a
+# millimetre is the most), and a pipe is straight to 0.2 % of its length.
+WALL_LEAN_RAD = math.radians(0.1)
+# Waves of a wall that a fitted cylinder follows: at least what any pipe has, else twice what is left over in a grid of
+# so many cells around and along, for the fit has flattened them.
+UNEVENNESS_MM, FLATTENED = 0.01, 2.0
+GRID = 10
 # How far a pipe's cut end may be from square (API 5L, 9.12.5.5), and how far the middle between two toes may be from
-# it in parts of the cap's width: a cap is as much wider on one side.
+# it in parts of the cap's width: a cap is as much wider on one side. A toe misread in one shot moves the middle
+# by half of what the widths differ; a cap so wide has a bar of its own.
 SQUARENESS_MM = 1.6
 CAP_PART = 0.2
 # An out-of-roundness of 2 % of the diameter moves the centre of a local circle by up to 1.5 % of it, to either side.
@@ -199,8 +202,8 @@ class _Seen:
     """There, unit, square to the axis."""
     direction_cov: Floats
     """(3, 3), rad^2, of the axis' direction, without the robot's."""
-    centre_gain: float
-    """How many times a wave of the wall moves the circle's centre: 1 / (1 - cos) of half the arc."""
+    centre_sigma_mm: float
+    """How far the wall's waves may move the centre of the fitted circle: 1 / (1 - cos) of half the arc times."""
 
     @classmethod
     def of(cls, view: PartView) -> _Seen:
@@ -218,11 +221,36 @@ class _Seen:
         # The axis leans towards the view, or turns across it: then the wall is twisted by along * sin(angle) only.
         twist = float(np.std((along - along.mean()) * np.sin(angle - middle)))
         towards = WALL_LEAN_RAD
-        sideways = math.hypot(WALL_LEAN_RAD, UNEVENNESS_MM / max(twist, 1e-3))
+        waves = _waves_mm(angle - middle, along, shot.deviation_mm[wall].astype(np.float64))
+        sideways = math.hypot(WALL_LEAN_RAD, waves / max(twist, 1e-3))
         covariance = towards**2 * np.outer(outward, outward) + sideways**2 * np.outer(across, across)
         half = float(np.quantile(np.abs(np.angle(np.exp(1j * (angle - middle)))), 0.98))
-        gain = 1 / max(1 - math.cos(half), 1e-4)
-        return cls(view, axis, origin + shot.radius_mm * outward, outward, covariance, gain)
+        centre = waves / max(1 - math.cos(half), 1e-4)
+        return cls(view, axis, origin + shot.radius_mm * outward, outward, covariance, centre)
+
+
+def _waves_mm(angle: Floats, along: Floats, deviation: Floats) -> float:
+    """How uneven a wall is beyond what is the same all along it (the pipe's form) or all around it (a drawn-in end)."""
+
+    def cells(values: Floats) -> NDArray[np.intp]:
+        edges = np.quantile(values, np.linspace(0, 1, GRID + 1)[1:-1])
+        return np.searchsorted(edges, values)
+
+    cell = cells(np.angle(np.exp(1j * angle))) * GRID + cells(along)
+    count = np.bincount(cell, minlength=GRID**2)
+    mean = np.bincount(cell, deviation, GRID**2) / np.maximum(count, 1)
+    grid = np.where(count >= LEAST_POINTS, mean, np.nan).reshape(GRID, GRID)
+    grid = grid - _middle(grid, 0)
+    grid = grid - _middle(grid, 1)
+    rms = float(np.sqrt(np.nanmean(np.square(grid)))) if np.isfinite(grid).any() else 0.0
+    return max(UNEVENNESS_MM, FLATTENED * rms)
+
+
+def _middle(grid: Floats, axis: int) -> Floats:
+    """The mean of what there is, kept as a dimension; 0 where there is nothing."""
+    there = np.isfinite(grid)
+    total = np.where(there, grid, 0.0).sum(axis=axis, keepdims=True)
+    return np.asarray(total / np.maximum(there.sum(axis=axis, keepdims=True), 1))
 
 
 def _placed_alike(views: Sequence[PartView], hand_eye: HandEye) -> list[Finding]:
@@ -282,8 +310,8 @@ def _misplaced(one: _Seen, other: _Seen, hand_eye: HandEye) -> Iterator[str]:
     along = float(axis @ between)
     direction = float(across @ (one.direction_cov + other.direction_cov + turned) @ across) / 4
     sigma = math.sqrt(_placing_mm(shots, hand_eye, middle, axis) ** 2 + direction)
-    width = max(one.view.shot.bead_width_mm, other.view.shot.bead_width_mm)
-    allowed = SQUARENESS_MM + CAP_PART * width + SIGMAS * sigma
+    widths = [s.view.shot.bead_width_mm for s in (one, other)]
+    allowed = SQUARENESS_MM + CAP_PART * min(widths) + abs(widths[0] - widths[1]) / 2 + SIGMAS * sigma
     if abs(along) > allowed:
         yield f"the seam is {abs(along):.1f} mm apart along the pipe ({allowed:.1f} at most)"
     # Where the axis is. The radii of two views of one place are one pipe's; of two places they need not be.
@@ -294,8 +322,7 @@ def _misplaced(one: _Seen, other: _Seen, hand_eye: HandEye) -> Iterator[str]:
     oval = OVAL_PART * 2 * radius * min(1.0, turn / OVAL_TURN_RAD)
     size = float(np.linalg.norm(off))
     placing = _placing_mm(shots, hand_eye, middle, off / size) if size > 0 else 0.0
-    arc = UNEVENNESS_MM * (one.centre_gain + other.centre_gain)
-    allowed = LARGEST_DIFFERENCE_MM + oval + SIGMAS * math.hypot(placing, arc)
+    allowed = LARGEST_DIFFERENCE_MM + oval + SIGMAS * math.hypot(placing, one.centre_sigma_mm, other.centre_sigma_mm)
     if size > allowed:
         yield f"its axis is {size:.1f} mm aside ({allowed:.1f} at most)"
 

@@ -358,15 +358,21 @@ def _seam(view: PartView, part: PartSpec) -> Iterator[Finding]:
         yield (bar("description", text, view.name) if lean > SEAM_BAR_DEG else warning("description", text, view.name))
 
 
-def other_part(points_mm: Floats, part: PartSpec, segmented: WeldShot | None = None) -> str | None:
-    """Why nothing is to be measured in a shot: its points are of another pipe than the one described.
+def other_part(
+    points_mm: Floats,
+    part: PartSpec,
+    axis: Sequence[float] | None = None,
+    segmented: WeldShot | None = None,
+) -> str | None:
+    """Why nothing is to be measured in a shot: its points are of another pipe than the one described, or lie otherwise.
 
-    The curvature of the points is found without the description. It is only looked for where the segmentation failed,
+    The cylinder of the points is found without the description. It is only looked for where the segmentation failed,
     or did not confirm the diameter.
 
     Args:
         points_mm: (H, W, 3), NaN where there is no point.
         part: as described.
+        axis: the stated direction of the pipe, in the frame of the points; None: not stated.
         segmented: what came of the description; None where nothing did.
 
     Returns:
@@ -382,10 +388,21 @@ def other_part(points_mm: Floats, part: PartSpec, segmented: WeldShot | None = N
         return None
     count = CURVATURE_POINTS if fit.inliers is None else len(fit.inliers)
     doubt = math.sqrt(max(float(fit.covariance[-1, -1]), 0.0) * max(1.0, count / INDEPENDENT_POINTS))
-    seen, told = 2 * fit.radius_mm, part.outside_diameter
-    if doubt > CURVATURE_DOUBT * fit.radius_mm or abs(seen / told - 1) <= OTHER_PIPE:
+    if doubt > CURVATURE_DOUBT * fit.radius_mm:
         return None
-    return f"{_measures(seen, told)}; correct part.outside_diameter, or scan the part that is meant"
+    seen, told = 2 * fit.radius_mm, part.outside_diameter
+    if abs(seen / told - 1) > OTHER_PIPE:
+        return f"{_measures(seen, told)}; correct part.outside_diameter, or scan the part that is meant"
+    if axis is None or segmented is not None:
+        return None
+    off = _angle_deg(np.asarray(axis) / np.linalg.norm(axis), fit.axis)
+    off = min(off, 180 - off)
+    if off <= AXIS_BAR_DEG:
+        return None
+    return (
+        f"part.axis_base is {off:.0f} degrees off the pipe in view, and no weld is found along it: correct axis_base; "
+        "if it is right, the hand-eye or the flange pose is another cell's"
+    )
 
 
 def not_used(session: Session, left_out: Sequence[tuple[str, str]], found: Sequence[Finding]) -> list[Finding]:
@@ -397,11 +414,15 @@ def not_used(session: Session, left_out: Sequence[tuple[str, str]], found: Seque
         found: so far: a shot that bars already is not named twice.
     """
     barred = {finding.shot for finding in found if finding.code in ("shot-altered", "shot-missing")}
-    names = {shot.name for shot in session.part_shots} - barred
-    reasons = {name: why for name, why in reversed(left_out) if name in names}
+    reasons = dict(reversed(left_out))
     return [
-        bar("shot-left-out", f"{name}: could not be used, and its part of the seam is missing: {why}", name)
-        for name, why in reasons.items()
+        bar(
+            "shot-left-out",
+            f"{shot.name}: could not be used, and its part of the seam is missing: {reasons[shot.name]}",
+            shot.name,
+        )
+        for shot in session.part_shots
+        if shot.name in reasons and shot.name not in barred
     ]
 
 

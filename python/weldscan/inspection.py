@@ -150,12 +150,12 @@ class _Run:
         try:
             segmented = segment_weld(scan.points_mm, part.outside_diameter / 2, part.wall_thickness, axis, zero)
         except GeometryError as error:
-            why = self.read.why_dark(shot) or other_part(scan.points_mm, part) or str(error)
+            why = self.read.why_dark(shot) or other_part(scan.points_mm, part, axis) or str(error)
             self.left_out.append((shot.name, why))
             return None
         finally:
             self.read.clock("segment", t)
-        if (other := other_part(scan.points_mm, part, segmented)) is not None:
+        if (other := other_part(scan.points_mm, part, axis, segmented)) is not None:
             self.left_out.append((shot.name, other))
             return None
         return PartView(

@@ -32,6 +32,8 @@ POINTS = 100_000
 ICP_POINTS = 10_000
 # Spacing of the modelled pipe's points. Distances are counted along the model's normals: it does not enter them.
 MODEL_SPACING_MM = 1.0
+# At most so many of them, a whole girth of 1220 mm a metre long: shots placed further apart are not of one part.
+MODEL_POINTS = 4_000_000
 
 
 def paper_step(points_mm: Floats, axis_point_mm: Floats, axis: Floats, radius_mm: float) -> Histogram:
@@ -96,7 +98,11 @@ def seam_place(axial: Floats, excess: Floats) -> float:
 
 
 def modelled_pipe(points_mm: Floats, axis_point_mm: Floats, axis: Floats, radius_mm: float) -> tuple[Floats, Floats]:
-    """Step 3: the pipe's surface as a cloud with outward normals, over the arcs and the length that were scanned."""
+    """Step 3: the pipe's surface as a cloud with outward normals, over the arcs and the length that were scanned.
+
+    Raises:
+        GeometryError: that is more than any scan of one part shows.
+    """
     across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     across /= np.linalg.norm(across)
     square = np.cross(axis, across)
@@ -106,6 +112,9 @@ def modelled_pipe(points_mm: Floats, axis_point_mm: Floats, axis: Floats, radius
     # A margin on either side, so that no point finds its nearest neighbour at the model's edge.
     turns = np.unique(np.floor(angle / step).astype(np.int64))
     turns = np.unique(turns[:, None] + np.arange(-4, 5)) * step
+    length = float(np.ptp(axial)) / MODEL_SPACING_MM + 8
+    if not length * len(turns) <= MODEL_POINTS:
+        raise GeometryError(f"the points reach over {np.ptp(axial):.4g} mm of the pipe: no modelled pipe is so long")
     rows = np.arange(axial.min() - 4 * MODEL_SPACING_MM, axial.max() + 4 * MODEL_SPACING_MM, MODEL_SPACING_MM)
     outward = np.cos(turns)[:, None] * across + np.sin(turns)[:, None] * square
     model = axis_point_mm + rows[:, None, None] * axis + radius_mm * outward

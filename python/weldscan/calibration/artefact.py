@@ -17,6 +17,8 @@ PAIRS = ((0, 1), (1, 2), (2, 0))
 # How much longer or shorter a distance may come out than it was touched: half a percent of it is far more than any
 # calibrated scanner's scale error, and far less than two spheres of a plate must differ to be told apart.
 SCALE_TOLERANCE = 0.005
+# The distance that a single wrong sphere has no part in fits: it is off by less than this part of the others.
+UNEXPLAINED = 0.25
 # Standard uncertainty of one coordinate of a touched centre, mm: contact probing with the robot.
 TOUCH_SIGMA_MM = 0.02
 
@@ -88,6 +90,7 @@ def find_plate(
             + " mm, those scanned "
             + ", ".join(f"{d:+.3f}" for d in off)
             + " mm off"
+            + _cause(off, wanted, SCALE_TOLERANCE * wanted + doubt(orders[0]))
         )
     seen = [order for order in fitting if same_side(centres[list(order)], touched_mm, base_from_flange)]
     if not seen:
@@ -137,7 +140,20 @@ def order_complaint(view: PlateView, reference_mm: Floats, touched: bool) -> str
         return f"its spheres are permuted: a distance is {worst:.3f} mm off; in the order {order} they fit {said}"
     return (
         f"this is not the plate in view: its distances are {', '.join(f'{d:+.3f}' for d in misfit(best))} mm off {said}"
+        + _cause(misfit(best), wanted, doubt)
     )
+
+
+def _cause(misfit: Floats, wanted: Floats, doubt: Floats) -> str:
+    """What would put the distances off like this: one sphere, whose two are off while the third fits; or the scale."""
+    pair, *others = np.argsort(np.abs(misfit))
+    if abs(misfit[pair]) < UNEXPLAINED * np.abs(misfit[others]).min():
+        sphere = next(j for j in range(3) if j not in PAIRS[pair])
+        return f": sphere {sphere + 1} alone explains it: touch it again"
+    scale = float(misfit @ wanted / (wanted @ wanted))
+    if np.all(np.abs(misfit - scale * wanted) <= doubt):
+        return f": all are {1 + scale:.4g} times as long: is the unit, the probe or the scanner's calibration wrong?"
+    return ""
 
 
 def same_side(centres_mm: Floats, touched_mm: Floats, base_from_flange: Floats) -> bool:

@@ -79,6 +79,8 @@ OUTLIER_PROBABILITY = 0.01
 # Poses should be tilted by 30 to 45 degrees to all sides; below a third of that the touches' bias is not separated.
 LEAST_TILT_RAD = math.radians(10)
 MAX_ITERATIONS = 30
+# A cause that leaves more than this part of the squares is none: honest touches leave a tenth of what calls for a word.
+UNEXPLAINED = 0.25
 
 
 def rotation_of(w: Floats) -> Floats:
@@ -517,13 +519,9 @@ def _warnings(problem: _Problem, found: _Found, result: HandEye) -> tuple[str, .
             f"the spheres scatter {result.sphere_sigma_ratio:.1f} times more than their fits say: is the scanner's "
             "calibration still good, are the spheres clean?"
         )
-    if result.probe_bias_mm is not None and result.probe_bias_u_mm is not None:
-        size, u = float(np.linalg.norm(result.probe_bias_mm)), float(result.probe_bias_u_mm.max())
-        if size > max(5 * problem.noise.touch_bias_mm, 3 * u):
-            said.append(
-                f"all touched centres are off together by {size:.3f} mm (u {u:.3f} mm), where "
-                f"{problem.noise.touch_bias_mm:g} mm were stated: check the length of the probe"
-            )
+    if problem.touched is not None:
+        sigma = np.sqrt(np.diag(found.posterior.covariance)[6:].reshape(3, 3).max(axis=1))
+        said += _about_touches(found.centres - problem.touched, sigma, result, problem.noise)
     second = result.tilts_deg[1]
     if len(problem.names) > 2 and math.radians(second) < LEAST_TILT_RAD:
         said.append(
@@ -531,6 +529,47 @@ def _warnings(problem: _Problem, found: _Found, result: HandEye) -> tuple[str, .
             "hand-eye from the touches' common error"
         )
     return tuple(said)
+
+
+def _about_touches(off: Floats, u: Floats, result: HandEye, noise: Noise) -> list[str]:
+    """What the touched centres are off by, and the cause that fits: the probe, one touch, or a plate that moved.
+
+    Args:
+        off: (3, 3), where the shots have each centre, less where it was touched.
+        u: (3,) standard uncertainty of the former, worst axis.
+        result: the hand-eye, with the probe's bias.
+        noise: what was stated.
+    """
+    sizes = np.linalg.norm(off, axis=1)
+    alone = sizes > np.maximum(6 * math.hypot(noise.touch_mm, noise.touch_bias_mm), 3 * u)
+    together, together_u = 0.0, 0.0
+    if result.probe_bias_mm is not None and result.probe_bias_u_mm is not None:
+        together, together_u = float(np.linalg.norm(result.probe_bias_mm)), float(result.probe_bias_u_mm.max())
+    if not (alone.any() or together > max(5 * noise.touch_bias_mm, 3 * together_u)):
+        return []
+    # What each cause would leave unexplained; all three move as many numbers, or twice as many for the plate.
+    left = {
+        "probe": float(np.square(off - off.mean(axis=0)).sum()),
+        **{f"sphere {j + 1}": float(np.square(np.delete(off, j, axis=0)).sum()) for j in range(3)},
+    }
+    cause = min(left, key=lambda name: left[name])
+    listed = ", ".join(f"{size:.3f}" for size in sizes)
+    if left[cause] > UNEXPLAINED * float(np.square(off).sum()):
+        return [
+            f"the touched centres are off by {listed} mm, each its own way (u {u.max():.3f} mm): was the plate moved "
+            "between touching and scanning, or was more than one sphere touched wrong?"
+        ]
+    if cause == "probe":
+        return [
+            f"all touched centres are off together by {together:.3f} mm (u {together_u:.3f} mm), where "
+            f"{noise.touch_bias_mm:g} mm were stated: check the length of the probe"
+        ]
+    j = int(cause[-1]) - 1
+    others = ", ".join(f"{size:.3f}" for size in np.delete(sizes, j))
+    return [
+        f"the touched centre of {cause} is off by {sizes[j]:.3f} mm (u {u[j]:.3f} mm), the others by {others} mm: "
+        "touch that sphere again"
+    ]
 
 
 def point_covariance(hand_eye: HandEye, point_mm: Floats) -> Floats:

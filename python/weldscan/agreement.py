@@ -184,10 +184,16 @@ def shots_agree(views: Sequence[PartView], hand_eye: HandEye) -> list[Finding]:
         hand_eye: through which they were placed.
 
     Returns:
-        Bars `shots-disagree`, each naming two shots (or the one that contradicts all others) with their numbers, and
-        warnings `agreement`.
+        Bars `shots-disagree`, each naming two shots (or the one that contradicts all others) with their numbers;
+        `hand-eye` where every shot contradicts every other; warnings `agreement`.
     """
-    return [*_placed_alike(views, hand_eye), *_stepped_alike(views, hand_eye)]
+    seen = [_Seen.of(view) for view in views]
+    misplaced = {
+        (i, j): complaints
+        for i, j in combinations(range(len(seen)), 2)
+        if (complaints := list(_misplaced(seen[i], seen[j], hand_eye)))
+    }
+    return [*_about_places(views, misplaced), *_stepped_alike(views, hand_eye, set(misplaced))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,42 +259,36 @@ def _middle(grid: Floats, axis: int) -> Floats:
     return np.asarray(total / np.maximum(there.sum(axis=axis, keepdims=True), 1))
 
 
-def _placed_alike(views: Sequence[PartView], hand_eye: HandEye) -> list[Finding]:
-    seen = [_Seen.of(view) for view in views]
-    said = {
-        (i, j): complaints
-        for i, j in combinations(range(len(seen)), 2)
-        if (complaints := list(_misplaced(seen[i], seen[j], hand_eye)))
-    }
+def _about_places(views: Sequence[PartView], misplaced: Mapping[tuple[int, int], Sequence[str]]) -> list[Finding]:
+    """What to say of pairs that put the pipe in different places: whose fault fits."""
+    names = [view.name for view in views]
+    worst = next(iter(misplaced), (0, 0))
     # One shot that contradicts all the others is named alone, where there are others that agree.
-    for k, view in enumerate(views):
-        with_it = [pair for pair in said if k in pair]
-        if len(views) > 2 and len(with_it) == len(views) - 1 == len(said):
+    for k, name in enumerate(names):
+        with_it = [pair for pair in misplaced if k in pair]
+        if len(views) > 2 and len(with_it) == len(views) - 1 == len(misplaced):
             other = next(i for i in with_it[0] if i != k)
-            return [
-                bar(
-                    "shots-disagree",
-                    f"{view.name} contradicts all other shots, which agree: against {views[other].name} "
-                    f"{'; '.join(said[with_it[0]])}: is its flange pose wrong, are its images another shot's, was the "
-                    "part moved?",
-                    view.name,
-                )
-            ]
-    most = len(said) == len(seen) * (len(seen) - 1) // 2 and len(seen) > 2
-    likely = (
-        "all shots contradict each other: is the hand-eye of this cell, are A, B, C in degrees?"
-        if most
-        else "were their images exchanged, is a flange pose wrong, was the part moved, is the hand-eye of another cell?"
-    )
-    found = [
+            text = (
+                f"{name} contradicts all other shots, which agree: against {names[other]} "
+                f"{'; '.join(misplaced[with_it[0]])}: is its flange pose wrong, are its images another shot's, was the "
+                "part moved?"
+            )
+            return [bar("shots-disagree", text, name)]
+    if len(views) > 2 and len(misplaced) == len(views) * (len(views) - 1) // 2:
+        text = (
+            f"all {len(views)} shots contradict each other; {names[worst[0]]} and {names[worst[1]]}: "
+            f"{'; '.join(misplaced[worst])}: is the hand-eye of this cell, are A, B and C in degrees?"
+        )
+        return [bar("hand-eye", text)]
+    return [
         bar(
             "shots-disagree",
-            f"{views[i].name} and {views[j].name} contradict each other: {'; '.join(complaints)}: {likely}",
-            views[j].name,
+            f"{names[i]} and {names[j]} contradict each other: {'; '.join(complaints)}: were their images exchanged, "
+            "is a flange pose wrong, was the part moved, is the hand-eye of another cell?",
+            names[j],
         )
-        for (i, j), complaints in said.items()
-    ]
-    return found[:MOST_SAID]
+        for (i, j), complaints in misplaced.items()
+    ][:MOST_SAID]
 
 
 def _misplaced(one: _Seen, other: _Seen, hand_eye: HandEye) -> Iterator[str]:
@@ -333,10 +333,14 @@ def _turning_rad(hand_eye: HandEye) -> float:
     return math.sqrt(2 * pose_sigma(hand_eye)[1] ** 2 + 4 * max(common, 0.0))
 
 
-def _stepped_alike(views: Sequence[PartView], hand_eye: HandEye) -> list[Finding]:
-    """The step of each shot alone, bin by bin, on the arcs that two of them saw."""
+def _stepped_alike(views: Sequence[PartView], hand_eye: HandEye, not_these: set[tuple[int, int]]) -> list[Finding]:
+    """The step of each shot alone, bin by bin, where two of them saw the seam; but for pairs whose angles are wrong."""
     degrees = [_bins_seen(view) for view in views]
-    pairs = [(i, j) for i, j in combinations(range(len(views)), 2) if len(degrees[i] & degrees[j]) >= LEAST_BINS]
+    pairs = [
+        (i, j)
+        for i, j in combinations(range(len(views)), 2)
+        if len(degrees[i] & degrees[j]) >= LEAST_BINS and (i, j) not in not_these
+    ]
     alone: dict[int, dict[int, tuple[float, float]]] = {}
     for k in sorted({k for pair in pairs for k in pair}):
         try:

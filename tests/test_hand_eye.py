@@ -266,6 +266,44 @@ def test_a_bias_of_the_probe_is_found():
     assert any("all touched centres are off together" in said for said in found.warnings)
 
 
+@pytest.mark.parametrize("sphere", [1, 2, 3])
+@pytest.mark.parametrize("shots", [3, SHOTS])
+def test_one_sphere_touched_wrong_is_named_and_not_the_probe(shots, sphere):
+    """1 mm along the plate's normal: no distance between the spheres tells."""
+    views, poses, touched = views_and_poses(shots, np.random.default_rng(sphere))
+    normal = np.cross(touched[1] - touched[0], touched[2] - touched[0])
+    touched[sphere - 1] += normal / np.linalg.norm(normal)
+    (said,) = [text for text in solve_hand_eye(views, poses, touched).warnings if "touched" in text]
+    assert said.startswith(f"the touched centre of sphere {sphere} is off by ") and "touch that sphere again" in said
+
+
+def test_a_plate_that_was_turned_after_touching_is_neither(shots=SHOTS):
+    views, poses, touched = views_and_poses(shots, np.random.default_rng(5))
+    middle = touched.mean(axis=0)
+    touched = (touched - middle) @ placed((0, 0, 0), (0.0, 0.0, 0.01))[:3, :3].T + middle
+    (said,) = [text for text in solve_hand_eye(views, poses, touched).warnings if "touched" in text]
+    assert "each its own way" in said and "was the plate moved" in said
+
+
+def test_good_touches_are_not_complained_of():
+    for seed in range(10):
+        assert solve_hand_eye(*views_and_poses(SHOTS, np.random.default_rng(seed))).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("move", "says"),
+    [
+        (lambda t: t + np.array([[0, 0, 0], [0, 0, 0], [1.5, 0, 0]]), "sphere 3 alone explains it"),
+        (lambda t: t * 1.03, "all are 0.97"),
+        (lambda t: t + np.array([[0, 0, 0], [1.5, 0, 0], [0, 2.5, 0]]), "mm off those touched$"),
+    ],
+)
+def test_distances_that_are_off_tell_the_cause(move, says):
+    views, poses, touched = views_and_poses(2)
+    with pytest.raises(PlateMismatch, match=says):
+        solve_hand_eye(views, poses, move(touched))
+
+
 @pytest.mark.parametrize("shots", [5, 9])
 def test_centres_need_not_be_touched(shots):
     views, poses, _ = views_and_poses(shots)

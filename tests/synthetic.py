@@ -10,13 +10,19 @@ from weldscan.norms import judge
 from weldscan.result import (
     ArtefactShot,
     BudgetLine,
+    Coverage,
+    Finding,
     HandEye,
     Histogram,
     Inspection,
     Label,
     PartCloud,
+    SeamBin,
     SphereFit,
     StepResult,
+    along_seam_mm,
+    bar,
+    note,
     warning,
 )
 
@@ -131,9 +137,11 @@ def inspection(
             "diameter_difference": 0.5,
             "diameter_difference_u": 0.01,
             "axis_offset": 0.16,
+            "axis_offset_u": 0.02,
             "axis_offset_at_deg": 205.0,
         },
         angle_between_walls_deg=0.04,
+        angle_between_walls_u_deg=0.03,
         coverage_deg=100.0,
     )
     verdicts = sum(
@@ -179,3 +187,70 @@ def nothing_measured() -> Inspection:
         frame="scanner",
         verdicts=judge("pnae-g-7-010-89", None, None, PART, why_not_measured="only one wall is in view"),
     )
+
+
+# --- with what bars it ------------------------------------------------------------------------------------------------
+
+
+def with_findings(
+    whole: Inspection, *findings: Finding, coverage: Coverage | None = None, required_deg: float | None = None
+) -> Inspection:
+    """The same inspection with these findings, judged again."""
+    verdicts = sum(
+        (
+            judge(
+                judgement.norm,
+                judgement.value_mm,
+                judgement.expanded_uncertainty_mm,
+                PART,
+                coverage_deg=whole.step.coverage_deg,
+                required_coverage_deg=required_deg,
+                bars=findings,
+            )
+            for judgement in whole.verdicts
+        ),
+        (),
+    )
+    return replace(whole, findings=findings, verdicts=verdicts, coverage=coverage)
+
+
+def seam_bin(angle_deg: float, measured: bool, **fate: int) -> SeamBin:
+    """One bin, with a cap where it was measured."""
+    along = along_seam_mm(angle_deg, PART)
+    return SeamBin(angle_deg, along, measured, fate, 12.4 if measured else None, (-6.1, 6.3) if measured else None)
+
+
+def seam_of(whole: Inspection, required: tuple[float, float]) -> tuple[SeamBin, ...]:
+    """Every bin of the required arc: measured where the profile is; a counterbore at 84-90, a dark arc between."""
+    seen = set(whole.step.angle_deg.tolist())
+    bins = []
+    for angle in np.arange(required[0], required[1] + 1, 2.0).tolist():
+        if angle not in seen:
+            bins.append(seam_bin(angle, False, dark=2600, saturated=160, hidden=300))
+        elif 84 <= angle <= 90:
+            bins.append(seam_bin(angle, True, wall=1800, transition=300, cap=700, gated=900, off_line=40, dark=20))
+        else:
+            bins.append(seam_bin(angle, True, wall=2700, transition=60, cap=740, dark=30, order_in_doubt=12))
+    return tuple(bins)
+
+
+def barred(points: int = 20_000, norms: tuple[str, ...] = ("pnae-g-7-010-89", "iso-5817:B", "nb-4232")) -> Inspection:
+    """What would be a PASS but for a gap, points that no wall took, and two shots that disagree."""
+    whole = inspection(points, norms=norms)
+    findings = (
+        bar("coverage", "113° to 171° of the seam were required and not seen", at_deg=142.0),
+        *(
+            bar(
+                "points-without-wall",
+                f"{900 + at:.0f} points beside the seam that neither wall nor cap explains",
+                "part-1",
+                at,
+            )
+            for at in (84.0, 86.0, 88.0, 90.0)
+        ),
+        bar("shots-disagree", "part-1 and part-2 differ by 0.412 mm at the seam, their joint U is 0.061 mm"),
+        warning("response", "part-2: the projector is not linear", "part-2"),
+        note("verification", "the scanner: no verification on record"),
+    )
+    coverage = Coverage(100.0, 158.0, "views", ((113.0, 171.0),))
+    return replace(with_findings(whole, *findings, coverage=coverage), seam=seam_of(whole, (62.0, 222.0)))

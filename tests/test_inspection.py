@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 
 from conftest import shared
 from test_simulate import small_scanner
-from weldscan import set_threads
+from weldscan import InputError, set_threads
 from weldscan.calibration.hand_eye import calibrate
 from weldscan.devices.simulated import DEFAULT, NO_BEAD, Bead, pipe, simulate_session
 from weldscan.inspection import inspect
@@ -239,6 +240,37 @@ def test_shots_that_saw_the_same_wall_are_held_against_each_other(recorded, tmp_
     (said,) = [warning for warning in moved.warnings if "disagree" in warning]
     assert said.startswith("part-1 and part-2 disagree by ") and "the step is not" in said
     np.testing.assert_allclose(moved.step.step_mm, found.step.step_mm, atol=0.005)
+
+
+def test_too_little_of_the_seam_is_inconclusive(recorded, tmp_path):
+    folder, _, found = recorded
+    seen = found.step.coverage_deg
+    assert found.words() == f"PASS over {seen:.0f}° of 360°" and found.headline.margin > 0
+    whole = inspect(folder, required_coverage_deg=360)
+    assert whole.verdict is Verdict.INCONCLUSIVE and [each.code for each in whole.headline.barred_by] == ["coverage"]
+
+    def require(document):
+        document["part"]["required_coverage_deg"] = seen + 2
+
+    required = respelt(folder, tmp_path / "session", require)
+    assert inspect(required).verdict is Verdict.INCONCLUSIVE
+    # What is asked for on the spot overrules the session.
+    assert inspect(required, required_coverage_deg=seen).verdict is Verdict.PASS
+    for wrong in (0, -1, 360.5, math.nan):
+        with pytest.raises(InputError, match="above 0 and at most 360"):
+            inspect(folder, required_coverage_deg=wrong)
+
+
+def test_no_number_without_its_uncertainty(recorded):
+    _, _, found = recorded
+    step = found.step
+    for name in step.harmonics_mm:
+        assert name.endswith(("_u", "_at_deg")) or math.isfinite(step.harmonics_mm[f"{name}_u"])
+    assert (step.angle_between_walls_deg is None) == (step.angle_between_walls_u_deg is None)
+    assert (step.angle_between_walls_deg is None) == ("angle_between_walls" in step.not_observable)
+    assert step.histogram.expanded_uncertainty_mm > 0 and step.seam_mean_u_mm > 0
+    (said,) = [finding for finding in found.findings if finding.code == "verification"]
+    assert said.severity == "note" and found.verification.state == "none"
 
 
 def flatten(shot: Path) -> None:

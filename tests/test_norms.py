@@ -8,7 +8,7 @@ import pytest
 
 from weldscan import InputError
 from weldscan.norms import judge, limit_mm, load_norm, norm_ids
-from weldscan.result import Verdict
+from weldscan.result import CODES, Verdict, bar, note, warning
 
 PNAE = "pnae-g-7-010-89"
 PIPE = {"kind": "pipe", "outside_diameter": 630.0, "wall_thickness": 6.0, "joint": "circumferential butt"}
@@ -180,7 +180,7 @@ def test_an_arc_that_was_not_seen_cannot_pass_where_it_is_required():
         return judge(PNAE, value, 0.1, PIPE, coverage_deg=seen, required_coverage_deg=360)[0].verdict
 
     assert verdict(0.1, 360.0) == Verdict.PASS
-    assert verdict(0.1, 96.0) == verdict(0.1, None) == Verdict.NOT_MEASURED
+    assert verdict(0.1, 96.0) == verdict(0.1, None) == Verdict.INCONCLUSIVE
     assert verdict(9.0, 96.0) == Verdict.FAIL
     (judgement,) = judge(PNAE, 0.1, 0.1, PIPE, coverage_deg=96)
     assert judgement.verdict == Verdict.PASS and "in the 96° of the seam that were seen" in judgement.reason
@@ -200,3 +200,62 @@ def test_every_norm_says_where_it_comes_from():
 def test_an_unknown_norm_is_refused(norm_id):
     with pytest.raises(InputError, match="there are iso-5817:B, "):
         judge(norm_id, 0.1, 0.1, PIPE)
+
+
+@pytest.mark.parametrize("code", CODES)
+def test_a_bar_turns_pass_into_inconclusive_and_nothing_else(code):
+    doubt = bar(code, "what is wrong", "part-2", 113.0)
+    (passed,) = judge(PNAE, 0.1, 0.05, PIPE, bars=[doubt])
+    assert passed.verdict == Verdict.INCONCLUSIVE and passed.barred_by == (doubt,)
+    assert passed.reason.startswith(f"would be PASS but for {code} (part-2, at 113°): what is wrong (0.100 mm")
+    for value, uncertainty in ((9.0, 0.05), (1.1, 0.05), (None, None)):
+        (without,) = judge(PNAE, value, uncertainty, PIPE)
+        (barred,) = judge(PNAE, value, uncertainty, PIPE, bars=[doubt])
+        assert barred == without and barred.verdict != Verdict.PASS and barred.barred_by == ()
+
+
+def test_only_bars_bar_and_the_first_are_named():
+    harmless = [note("paper", "a"), warning("pose", "b")]
+    assert judge(PNAE, 0.1, 0.05, PIPE, bars=harmless)[0].verdict == Verdict.PASS
+    doubts = [bar("cap", f"number {i}") for i in range(5)]
+    (judgement,) = judge(PNAE, 0.1, 0.05, PIPE, bars=[*harmless, *doubts])
+    assert "cap: number 0; cap: number 1; and 3 more" in judgement.reason and len(judgement.barred_by) == 5
+
+
+def test_too_little_of_the_seam_is_said_once():
+    (judgement,) = judge(PNAE, 0.1, 0.05, PIPE, coverage_deg=96, required_coverage_deg=120)
+    assert "coverage: 96° of the seam were seen, 120° are required" in judgement.reason
+    (whole,) = judge(PNAE, 0.1, 0.05, PIPE, coverage_deg=358, required_coverage_deg=360)
+    assert "the whole seam is required" in whole.reason
+    gaps = bar("coverage", "100° to 124° were not seen", at_deg=112.0)
+    (told,) = judge(PNAE, 0.1, 0.05, PIPE, coverage_deg=96, required_coverage_deg=120, bars=[gaps])
+    assert told.barred_by == (gaps,)
+
+
+@pytest.mark.parametrize("value", [0.9, -0.9])
+def test_bounds_margin_and_probability(value):
+    (judgement,) = judge(PNAE, value, 0.2, PIPE)
+    assert judgement.interval_mm == pytest.approx((0.7, 1.1)) and judgement.margin == pytest.approx(0.0, abs=1e-12)
+    # One tail of a normal distribution at k = 2.
+    assert judgement.probability_over_limit == pytest.approx(0.0227501, abs=1e-6)
+    (small,) = judge(PNAE, value / 9, 0.2, PIPE)
+    assert small.interval_mm == pytest.approx((0.0, 0.3)) and small.margin == pytest.approx(0.8 / 1.1)
+
+
+def test_the_probability_has_two_sides_and_ends():
+    (centred,) = judge(PNAE, 0.0, 2.2, PIPE)
+    assert centred.probability_over_limit == pytest.approx(2 * 0.1586553, abs=1e-6)
+    assert [judge(PNAE, h, 0.0, PIPE)[0].probability_over_limit for h in (1.1, 1.2)] == [0.0, 1.0]
+    assert judge(PNAE, 5.0, 0.1, PIPE)[0].probability_over_limit == 1.0
+    for value, uncertainty in ((None, 0.1), (0.1, None), (math.nan, 0.1), (0.1, -1.0)):
+        (judgement,) = judge(PNAE, value, uncertainty, PIPE)
+        assert judgement.interval_mm is judgement.margin is judgement.probability_over_limit is None
+
+
+@pytest.mark.parametrize(
+    ("norm", "doubt"), [(PNAE, ""), ("iso-5817:B", "limit second-hand"), ("nb-4232", "limit from memory")]
+)
+def test_how_a_limit_was_come_by_is_said(norm, doubt):
+    (judgement,) = judge(norm, 0.1, 0.01, PIPE)
+    assert judgement.doubt == doubt and judgement.evidence == judgement.details["evidence"]
+    assert judgement.rule == {PNAE: "as_printed", "iso-5817:B": "B", "nb-4232": "as_remembered"}[norm]

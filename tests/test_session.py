@@ -163,6 +163,8 @@ def test_a_session_that_fails_half_way_leaves_nothing(tmp_path):
     [
         ("schema", "weldscan-session/2", "schema: should be 'weldscan-session/1', not \"weldscan-session/2\""),
         ("schema", GONE, "schema: missing"),
+        ("part.required_coverage_deg", 0, "part.required_coverage_deg: should be greater than 0"),
+        ("part.required_coverage_deg", 361, "part.required_coverage_deg: should be less than or equal to 360"),
         ("name", GONE, "name: missing"),
         ("colour", "red", "colour: unknown field"),
         ("shots.1.flange_pose.B", float("nan"), "shots.1.flange_pose.B: NaN is not a number"),

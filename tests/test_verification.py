@@ -687,6 +687,8 @@ def test_what_a_session_may_rely_on(session, tmp_path, verdict, day, scanner, sa
     append_history(path, made_up(verdict, day=day, scanner=scanner or mine))
     standing = standing_of(read, path)
     assert standing.good == (says is None) and (says is None or says in standing.text)
+    assert standing.state == ("verified" if says is None else "expired" if "expired" in says else "failed")
+    assert standing.relied_on == standing.good
     # What was made up was verified with fringes that nobody knows.
     assert any("verified with fringes unknown, this session has x 1 x 4" in n for n in standing.notes) == (not scanner)
     accepted = standing_of(read, path, "checked by hand")
@@ -719,7 +721,9 @@ def test_a_session_with_the_fringes_of_the_verification_needs_no_note(session, f
 def test_where_the_history_is_looked_for(session, tmp_path):
     folder = edited(session, tmp_path / "s", only("part", "artefact"))
     read = read_session(folder)
-    assert standing_of(read).text == "no verification on record" and standing_of(read).good
+    none = standing_of(read)
+    assert none.text == none.statement == "no verification on record" and none.state == "none"
+    assert none.relied_on and not none.good
     mine = scanner_id(read.scanner)
     append_history(tmp_path / "verification.jsonl", made_up(scanner=mine))
     assert standing_of(read).history == str(tmp_path / "verification.jsonl") and standing_of(read).good

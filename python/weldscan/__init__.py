@@ -77,7 +77,7 @@ if TYPE_CHECKING:
     from weldscan.inspection import inspect
     from weldscan.norms import judge, limit_mm, norm_ids
     from weldscan.paper_method import paper_step
-    from weldscan.report import write_report
+    from weldscan.report import read_result, write_report
     from weldscan.report.validation import write_validation
     from weldscan.report.verification import write_verification
     from weldscan.response import FringeResponse, Response, read_response, response_of_ramp, write_response
@@ -103,7 +103,7 @@ _LAZY = {
     "weldscan.inspection": ("inspect",),
     "weldscan.paper_method": ("paper_step",),
     "weldscan.norms": ("judge", "limit_mm", "norm_ids"),
-    "weldscan.report": ("write_report",),
+    "weldscan.report": ("read_result", "write_report"),
     "weldscan.report.validation": ("write_validation",),
     "weldscan.report.verification": ("write_verification",),
     "weldscan.response": ("FringeResponse", "Response", "read_response", "response_of_ramp", "write_response"),
@@ -223,6 +223,7 @@ __all__ = [
     "read_history",
     "read_limits",
     "read_response",
+    "read_result",
     "read_scanner",
     "read_session",
     "register_icp",

@@ -1,7 +1,8 @@
 """The command line: `weldscan inspect`, `demo`, `validate`, `verify`; `calibrate` and the live cell bring theirs.
 
 Heavy imports happen inside the commands, so that `--help` and a typing error answer at once. What went well goes to
-stdout; progress (a bar on a terminal, JSON lines otherwise) and complaints, each in one line, go to stderr.
+stdout; progress (a bar on a terminal, JSON lines otherwise) and complaints, each in one line, go to stderr. A verdict's
+exit code is fixed before anything is printed: a console that lacks a character or a reader that left change nothing.
 """
 
 from __future__ import annotations
@@ -11,21 +12,22 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from weldscan import terminal
 from weldscan._weldcore import __version__
 from weldscan.calibration.cli import register as register_calibrations
 from weldscan.errors import InputError, NotMeasured, WeldscanError
-from weldscan.result import Verdict
+from weldscan.result import Severity, Verdict
 from weldscan.station.cli import register as register_cell
 
 if TYPE_CHECKING:
-    from weldscan.result import Inspection, Verification
+    from weldscan.result import Inspection, StepResult, Verification
 
 EXIT_CODES = {
     Verdict.PASS: 0,
@@ -40,6 +42,9 @@ EXITS = (
 )
 DEFAULT_NORM = "pnae-g-7-010-89"
 COLOURS = {Verdict.PASS: 32, Verdict.FAIL: 31, Verdict.INCONCLUSIVE: 33}
+# PASS of a part of the seam, and what was not measured or cannot be assessed.
+PART_COLOUR, NO_COLOUR = 36, 35
+WHOLE_DEG = 360.0
 
 Progress = Callable[[int, int, str], None]
 
@@ -121,6 +126,16 @@ def inspect(
             metavar="auto|off|FILE",
         ),
     ] = "auto",
+    require_coverage: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DEG|whole",
+            help="How much of the seam must be seen for a PASS; less is INCONCLUSIVE. Default: what the session says.",
+        ),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print result.json instead of the summary: one document on stdout.")
+    ] = False,
 ) -> None:
     """Measure a recorded session and judge it: result.json, report.html, profile.csv, cloud.ply."""
     from weldscan.norms import load_norm
@@ -131,10 +146,14 @@ def inspect(
     for norm_id in norms:
         load_norm(norm_id)
     out = out if out is not None else Path(f"{session.resolve().name}-report")
+    required = None if require_coverage is None else _coverage(require_coverage)
     whole_folder.check(out, is_result)
-    found = _inspect_into(session, out, method, norms, response, history, accept_verification)
-    _summary(found, out)
-    raise typer.Exit(EXIT_CODES[found.verdict])
+    found = _inspect_into(session, out, method, norms, response, history, accept_verification, required)
+    with terminal.answer(EXIT_CODES[found.verdict]):
+        if as_json:
+            _document(out)
+        else:
+            _summary(found, out)
 
 
 @app.command(epilog="Example: weldscan demo --out /tmp/weldscan-demo")
@@ -161,12 +180,12 @@ def demo(
             else:
                 truth = simulate_session(partial / "session", progress=progress)
         found = _inspect_into(partial / "session", partial / "report", Method.surface, (DEFAULT_NORM,))
-    _summary(found, out / "report")
-    if truth is not None:
-        true = truth["step_mm"]
-        print(f"       truth: largest {true['max_abs']:.3f} mm, mean {true['mean']:.3f} mm")
-    print(f"       the same again from its images: weldscan inspect {out / 'session'}")
-    raise typer.Exit(EXIT_CODES[found.verdict])
+    with terminal.answer(EXIT_CODES[found.verdict]):
+        _summary(found, out / "report")
+        if truth is not None:
+            true = truth["step_mm"]
+            print(f"       truth: largest {true['max_abs']:.3f} mm, mean {true['mean']:.3f} mm")
+        print(f"       the same again from its images: weldscan inspect {out / 'session'}")
 
 
 @app.command(epilog="Example: weldscan validate pipe-17 --touch pipe-17/touch.csv --out pipe-17-touch")
@@ -190,11 +209,12 @@ def validate(
     with _progress() as progress:
         found = hold_against(session, touch, progress)
         write_validation(found, out)
-    print(
-        f"{found.compared} of {len(found.points_mm)} probed points: rms {found.rms_mm:.3f} mm, "
-        f"mean {found.mean_mm:+.3f} ± {found.mean_u_mm:.3f} mm (k = 2), largest {found.max_abs_mm:.3f} mm"
-    )
-    print(f"report: {out / 'validation.html'}")
+    with terminal.answer():
+        print(
+            f"{found.compared} of {len(found.points_mm)} probed points: rms {found.rms_mm:.3f} mm, "
+            f"mean {found.mean_mm:+.3f} ± {found.mean_u_mm:.3f} mm (k = 2), largest {found.max_abs_mm:.3f} mm"
+        )
+        print(f"report: {out / 'validation.html'}")
 
 
 @app.command(
@@ -249,8 +269,8 @@ def verify(
         write_verification(found, out)
     if history is not None and found.verdict is not Verdict.NOT_ASSESSABLE:
         append_history(history, found)
-    _told(found, out, history)
-    raise typer.Exit(EXIT_CODES[found.verdict])
+    with terminal.answer(EXIT_CODES[found.verdict]):
+        _told(found, out, history)
 
 
 # --- behind the commands ----------------------------------------------------------------------------------------------
@@ -264,12 +284,17 @@ def _inspect_into(
     response: str = "auto",
     history: Path | None = None,
     accept: str | None = None,
+    required_coverage_deg: float | None = None,
 ) -> Inspection:
     from weldscan.inspection import inspect as measure
     from weldscan.report import write_report
 
     with _progress() as progress:
-        asked = {"history": history, "accept_verification": accept}
+        asked = {
+            "history": history,
+            "accept_verification": accept,
+            "required_coverage_deg": required_coverage_deg,
+        }
         given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
         found: Inspection = measure(
             session, method=method.value, norms=norms, response=response, progress=progress, **given
@@ -279,36 +304,80 @@ def _inspect_into(
     return found
 
 
+def _coverage(text: str) -> float:
+    """What `--require-coverage` asks for, degrees."""
+    try:
+        degrees = WHOLE_DEG if text.strip().casefold() == "whole" else float(text)
+    except ValueError:
+        degrees = 0.0
+    if not 0 < degrees <= WHOLE_DEG:
+        raise typer.BadParameter(
+            f"{text!r} is neither 'whole' nor degrees above 0, at most 360", param_hint="--require-coverage"
+        )
+    return degrees
+
+
+def _coloured(words: str, colour: int) -> str:
+    return f"\x1b[1;{colour}m{words}\x1b[0m" if terminal.is_terminal(sys.stdout) else words
+
+
+def _document(out: Path) -> None:
+    # Escapes for whatever is not ASCII: the document is the same on every console.
+    print(json.dumps(json.loads((out / "result.json").read_text(encoding="utf-8")), indent=1))
+
+
 def _summary(found: Inspection, out: Path) -> None:
-    """A few lines: the verdict, the value with its uncertainty, the limit, where, and the report's path."""
-    colour = COLOURS.get(found.verdict, 36)
-    word = f"\x1b[1;{colour}m{found.verdict}\x1b[0m" if sys.stdout.isatty() else found.verdict
-    step = found.step
-    worst = next((judgement for judgement in found.verdicts if judgement.verdict == found.verdict), None)
-    why = f"{worst.norm}{', ' if worst.clause else ''}{worst.clause}: {worst.reason}" if worst else "no norm was asked"
-    print(f"{word}   {why}")
+    """A few lines: the verdict, what bars it, the value with its uncertainty, where, and the report's path."""
+    from weldscan.report import judgement_text
+
+    def words(verdict: Verdict) -> str:
+        part = verdict is Verdict.PASS and not found.whole
+        return _coloured(found.words(verdict), PART_COLOUR if part else COLOURS.get(verdict, NO_COLOUR))
+
+    step, headline = found.step, found.headline
+    print(f"{words(found.verdict)}   {judgement_text(headline) if headline else 'no norm was asked'}")
+    for finding in found.bars:
+        print(f"       {_coloured('bars PASS', COLOURS[Verdict.FAIL])}: {finding}")
     if step is not None:
-        histogram = "" if step.histogram is None else f", paper's histogram {step.histogram.step_mm:.3f} mm"
         print(
             f"       largest step {step.max_abs_mm:.3f} ± {step.expanded_uncertainty_mm:.3f} mm (k = 2) "
-            f"at {step.max_abs_at_deg:.0f}°, mean {step.mean_mm:.3f} mm{histogram}"
+            f"at {step.max_abs_at_deg:.0f}°{_others(step)}"
+        )
+    if found.coverage is not None:
+        gaps = ", ".join(f"{start:.0f}° to {end:.0f}°" for start, end in found.coverage.gaps)
+        print(
+            f"       seam: {found.coverage.seen_deg:.0f}° seen, {found.coverage.required_deg:.0f}° required "
+            f"({found.coverage.required_by}){f'; not seen: {gaps}' if gaps else ''}"
         )
     for judgement in found.verdicts:
-        if judgement is not worst:
-            print(f"       {judgement.verdict} by {judgement.norm}, {judgement.clause}: {judgement.reason}")
+        if judgement is not headline:
+            print(f"       {words(judgement.verdict)} by {judgement_text(judgement)}")
+    if found.calibration != "stated":
+        print(f"       scanner's calibration: {found.calibration}, U leaves it out")
     if found.verification is not None:
         print(f"       scanner: {found.verification.statement}")
     for shot, reason in found.left_out:
         print(f"       left out {shot}: {reason}")
-    for warning in found.warnings:
-        print(f"       note: {warning}")
+    for each in found.findings:
+        if each.severity is not Severity.BAR and each.code != "verification":
+            print(f"       {each.severity}: {each.text}")
     print(f"       report: {out / 'report.html'}")
+
+
+def _others(step: StepResult) -> str:
+    """The mean and the paper's number, each with its U, where they have one."""
+    said = ""
+    if step.seam_mean_mm is not None and step.seam_mean_u_mm is not None:
+        said += f", mean {step.seam_mean_mm:.3f} ± {step.seam_mean_u_mm:.3f} mm"
+    histogram = step.histogram
+    if histogram is not None and histogram.expanded_uncertainty_mm is not None:
+        said += f", paper's histogram {histogram.step_mm:.3f} ± {histogram.expanded_uncertainty_mm:.3f} mm"
+    return said
 
 
 def _told(found: Verification, out: Path, history: Path | None) -> None:
     """The verdict, a line per characteristic, what was lost, the drift, and where it all went."""
-    colour = COLOURS.get(found.verdict, 36)
-    word = f"\x1b[1;{colour}m{found.verdict}\x1b[0m" if sys.stdout.isatty() else found.verdict
+    word = _coloured(found.verdict, COLOURS.get(found.verdict, NO_COLOUR))
     print(f"{word}   scanner {found.scanner}, {found.date}, valid until {found.valid_until}")
     for each in found.characteristics:
         value = "-" if each.value_mm is None else f"{each.value_mm:+.4f} mm at {each.where}"
@@ -342,10 +411,10 @@ def _is_demo(folder: Path) -> bool:
 @contextmanager
 def _progress() -> Iterator[Progress]:
     """Shows how far it is: a bar on a terminal, JSON lines otherwise; on stderr in both cases."""
-    if not sys.stderr.isatty():
+    if not terminal.is_terminal(sys.stderr):
 
         def tell(done: int, total: int, what: str) -> None:
-            print(json.dumps({"done": done, "of": total, "what": what}), file=sys.stderr, flush=True)
+            terminal.complain(json.dumps({"done": done, "of": total, "what": what}))
 
         yield tell
         return
@@ -382,8 +451,12 @@ register_cell(app, _progress)
 
 def main() -> None:
     """The entry point: whatever happens, one line and the exit code of the contract."""
+    terminal.prepare()
+    code: str | int | None
     try:
         app()
+    except SystemExit as ended:
+        code = ended.code
     except KeyboardInterrupt:
         code = _complain("interrupted; nothing was written", INTERRUPTED)
     except NotMeasured as error:
@@ -391,21 +464,23 @@ def main() -> None:
     except WeldscanError as error:
         code = _complain(error, BAD_INPUT)
     except BrokenPipeError:
-        # Whoever read our output went away; Python would complain once more while it closes stdout.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # Whoever read our output went away, and no verdict was due.
         code = OUR_FAULT
     except Exception as error:
         if os.environ.get("WELDSCAN_TRACEBACK"):
-            traceback.print_exc()
+            with suppress(OSError):
+                traceback.print_exc()
         code = _complain(
             f"an error of weldscan itself: {type(error).__name__}: {error} (WELDSCAN_TRACEBACK=1 shows where)",
             OUR_FAULT,
         )
     else:
-        return
-    sys.exit(code)
+        code = None
+    terminal.settle()
+    if code is not None:
+        sys.exit(code)
 
 
 def _complain(message: object, code: int) -> int:
-    print(f"weldscan: {' '.join(str(message).split())}", file=sys.stderr)
+    terminal.complain(f"weldscan: {' '.join(str(message).split())}")
     return code

@@ -10,6 +10,7 @@ import os
 import platform
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, date, datetime
 from typing import Any, Literal, cast
 
@@ -28,18 +29,22 @@ from weldscan.description import held_against_itself, held_against_record, held_
 from weldscan.errors import GeometryError, InputError
 from weldscan.manifest import faults as faults_of
 from weldscan.norms import judge, load_norm
+from weldscan.observable import seam_terms
 from weldscan.paper_method import paper_step
 from weldscan.part_views import PartView
 from weldscan.points import Compensate, PointReader, Progress
 from weldscan.response import Response, read_response
 from weldscan.result import (
+    WHOLE_TURN_DEG,
     BudgetLine,
+    Finding,
     HandEye,
     Histogram,
     Inspection,
     PartCloud,
     ScannerRecord,
     ShotAgreement,
+    Standing,
     StepResult,
     note,
     warning,
@@ -60,6 +65,7 @@ def inspect(
     history: str | os.PathLike[str] | None = None,
     accept_verification: str | None = None,
     response: str | os.PathLike[str] | Response = "auto",
+    required_coverage_deg: float | None = None,
     progress: Progress | None = None,
 ) -> Inspection:
     """The step of a weld with its uncertainty and verdicts, from a session folder.
@@ -74,6 +80,8 @@ def inspect(
         response: of the projector. `auto`: what the fringes themselves show above the noise is taken off their phase;
             `off`: nothing; or a response, or the file of one (`weldscan calibrate response`), for patterns that were
             not corrected.
+        required_coverage_deg: how much of the seam must be seen for a PASS, 360 for all of it; by default what the
+            session's `part.required_coverage_deg` says.
         progress: called with (done, total, what) while it works.
 
     Returns:
@@ -92,7 +100,7 @@ def inspect(
         >>> abs(result.step.max_abs_mm - abs(truth["step_mm"]["max_abs"])) < result.step.expanded_uncertainty_mm
         True
     """
-    run = _Run(folder, method, norms, response, progress, history, accept_verification)
+    run = _Run(folder, method, norms, response, progress, history, accept_verification, required_coverage_deg)
     # 1-4  the three-sphere plate in every artefact shot: where the scanner sits on the flange
     hand_eye = hand_eye_of(run.read, run.left_out)
     # 5-6  every part shot: its points, its place in base, reference wall, other wall and bead
@@ -115,9 +123,13 @@ class _Run:
         progress: Progress | None,
         history: str | os.PathLike[str] | None,
         accept_verification: str | None,
+        required_coverage_deg: float | None = None,
     ) -> None:
         if method not in METHODS:
             raise InputError(f"method: must be one of {', '.join(METHODS)}, got {method!r}")
+        if required_coverage_deg is not None and not 0 < required_coverage_deg <= WHOLE_TURN_DEG:
+            raise InputError(f"required_coverage_deg: must be above 0 and at most 360, got {required_coverage_deg!r}")
+        self.required_coverage_deg = required_coverage_deg
         for norm in norms:
             load_norm(norm)
         self.session = read_session(folder)
@@ -198,7 +210,7 @@ class _Run:
             t = self.read.clock("agreement", t)
         histogram = self.paper(cloud, welds[0])
         self.read.clock("paper", t)
-        return _step_result(step, histogram), cloud
+        return _step_result(step, histogram, self.part), cloud
 
     def hold_together(self, cloud: PartCloud, welds: Sequence[PartView], hand_eye: HandEye) -> None:
         """Shots that saw the same wall, held against each other in base."""
@@ -223,25 +235,40 @@ class _Run:
         self.read.findings += not_used(self.session, self.left_out, self.read.findings)
         value, expanded, coverage = None, None, None
         if step is not None:
+            if step.histogram is not None:
+                u_mm = self.paper_uncertainty_mm(step, cloud, hand_eye)
+                step = replace(step, histogram=replace(step.histogram, expanded_uncertainty_mm=u_mm))
             value, expanded, coverage = step.max_abs_mm, step.expanded_uncertainty_mm, step.coverage_deg
             if self.method == "paper":
                 value = None if step.histogram is None else step.histogram.step_mm
-                expanded = self.paper_uncertainty_mm(step, cloud, hand_eye)
+                expanded = None if step.histogram is None else step.histogram.expanded_uncertainty_mm
         part = self.part.model_dump()
-        if not self.standing.relied_on:
-            value, expanded = None, None
         reason = "; ".join(f"{name}: {why}" for name, why in self.left_out) or "method paper gave no answer"
         if not self.standing.relied_on:
+            value, expanded = None, None
             reason = f"the scanner is not verified: {self.standing.text}"
-        verdicts = [
-            verdict
-            for norm in self.norms
-            for verdict in judge(norm, value, expanded, part, why_not_measured=reason, coverage_deg=coverage)
-        ]
+        # Whatever finds something stands before the verdict: a bar found later would not count.
         scanner = self.scanner_record()
         compensated = response_record(self.response, self.read.phase_errors)
         if compensated["note"]:
             self.read.findings.append(note("response", compensated["note"]))
+        if (said := about_verification(self.standing)) is not None:
+            self.read.findings.append(said)
+        required = self.part.required_coverage_deg if self.required_coverage_deg is None else self.required_coverage_deg
+        verdicts = [
+            verdict
+            for norm in self.norms
+            for verdict in judge(
+                norm,
+                value,
+                expanded,
+                part,
+                why_not_measured=reason,
+                coverage_deg=coverage,
+                required_coverage_deg=required,
+                bars=self.read.findings,
+            )
+        ]
         timing = self.read.timing
         timing["compute"] = sum(seconds for what, seconds in timing.items() if what != "read")
         return Inspection(
@@ -316,6 +343,13 @@ class _Run:
         return expanded + abs(step.histogram.step_mm - float(np.abs(step.step_mm).mean()))
 
 
+def about_verification(standing: Standing) -> Finding | None:
+    """What to say of the scanner's verification; nothing where it is good, or where nothing is judged without it."""
+    if standing.accepted is not None and standing.state != "verified":
+        return warning("verification", f"the scanner's verification: {standing.statement}")
+    return note("verification", f"the scanner: {standing.text}") if standing.state == "none" else None
+
+
 def _compensation(response: str | os.PathLike[str] | Response) -> Compensate:
     if response in ("auto", "off"):
         return cast(Literal["auto", "off"], response)
@@ -369,12 +403,11 @@ BUDGET = (
 )
 
 
-def _step_result(step: dict[str, Any], histogram: Histogram | None) -> StepResult:
+def _step_result(step: dict[str, Any], histogram: Histogram | None, part: PartSpec) -> StepResult:
     profile = step["profile"]
     columns = step["profile_columns"]
     worst = profile[int(np.argmax(np.abs(profile[:, columns.index("step_mm")])))]
-    offset = step["axis_offset_mm"]
-    difference, difference_sigma = step["radius_difference_mm"]
+    terms = seam_terms(step, part.outside_diameter, part.wall_thickness)
     return StepResult(
         mean_mm=step["mean_mm"],
         median_mm=step["median_mm"],
@@ -388,12 +421,9 @@ def _step_result(step: dict[str, Any], histogram: Histogram | None) -> StepResul
         budget=tuple(
             BudgetLine(name, float(worst[columns.index(column)]), derived) for column, name, derived in BUDGET
         ),
-        harmonics_mm={
-            "diameter_difference": 2 * difference,
-            "diameter_difference_u": 4 * difference_sigma,
-            "axis_offset": float(np.hypot(*offset)),
-            "axis_offset_at_deg": float(np.degrees(np.arctan2(offset[1], offset[0])) % 360),
-        },
-        angle_between_walls_deg=float(np.degrees(step["tilt_rad"])),
+        harmonics_mm=terms.harmonics_mm,
+        angle_between_walls_deg=terms.angle_deg,
+        angle_between_walls_u_deg=terms.angle_u_deg,
+        not_observable=terms.not_observable,
         coverage_deg=step["coverage_deg"],
     )

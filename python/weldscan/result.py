@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from weldscan._weldcore import Lens, Scanner
 
 Floats = NDArray[np.float64]
+WHOLE_TURN_DEG = 360.0
 
 
 class Verdict(StrEnum):
@@ -88,6 +91,16 @@ class Finding:
         if self.code not in CODES:
             raise ValueError(f"{self.code!r} is no code of a finding")
 
+    @property
+    def where(self) -> str:
+        """The place in words: `part-2, at 113°`; empty where it is about the whole."""
+        return ", ".join(
+            ([self.shot] if self.shot else []) + ([] if self.at_deg is None else [f"at {self.at_deg:.0f}°"])
+        )
+
+    def __str__(self) -> str:
+        return f"{self.code}{f' ({self.where})' if self.where else ''}: {self.text}"
+
 
 def bar(code: str, text: str, shot: str | None = None, at_deg: float | None = None) -> Finding:
     """A finding that bars PASS."""
@@ -126,6 +139,16 @@ class SeamBin:
     """Both toes, along the axis from the seam's centreline: reference side, other side."""
 
 
+def along_seam_mm(angle_deg: float, part: Mapping[str, Any]) -> float | None:
+    """Length along the seam of a pipe from its zero mark, on the rated outside; None where no diameter is known.
+
+    >>> round(along_seam_mm(90.0, {"outside_diameter": 400.0}), 3)
+    314.159
+    """
+    diameter = part.get("outside_diameter")
+    return None if not diameter else math.radians(angle_deg % 360) * diameter / 2
+
+
 @dataclass(frozen=True)
 class Coverage:
     """How much of the seam was seen, and how much had to be."""
@@ -156,6 +179,56 @@ class Judgement:
     reason: str
     details: dict[str, Any] = field(default_factory=dict)
     """Whatever else the norm's file says: edition, evidence, both limits where the table is ambiguous ..."""
+    barred_by: tuple[Finding, ...] = ()
+    """What keeps the number from being a PASS; empty where nothing does, or where it would be none anyway."""
+
+    @property
+    def rule(self) -> str:
+        """Which reading or quality level of the clause's table gives the limit."""
+        return str(self.details.get("reading", ""))
+
+    @property
+    def quantity(self) -> str:
+        """What the norm limits."""
+        return str(self.details.get("quantity", ""))
+
+    @property
+    def evidence(self) -> str:
+        """How the limit was come by: read in a source, second-hand, from memory."""
+        return str(self.details.get("evidence", ""))
+
+    @property
+    def doubt(self) -> str:
+        """What to say beside the verdict where the limit was not read in the norm itself or a copy; else empty."""
+        if "memory" in self.evidence:
+            return "limit from memory"
+        return "limit second-hand" if "second-hand" in self.evidence else ""
+
+    @property
+    def interval_mm(self) -> tuple[float, float] | None:
+        """Lower and upper bound of the magnitude, |h| - U (not below zero) and |h| + U; None where one is unknown."""
+        value, u = self.value_mm, self.expanded_uncertainty_mm
+        if value is None or u is None or not (math.isfinite(value) and math.isfinite(u) and u >= 0):
+            return None
+        return max(abs(value) - u, 0.0), abs(value) + u
+
+    @property
+    def margin(self) -> float | None:
+        """How far the upper bound stays below the limit, as a share of it; negative above it."""
+        if self.interval_mm is None or not self.limit_mm:
+            return None
+        return (self.limit_mm - self.interval_mm[1]) / self.limit_mm
+
+    @property
+    def probability_over_limit(self) -> float | None:
+        """Of |h| > L for a normal distribution about the value with u = U/2 (JCGM 106), both sides."""
+        if self.interval_mm is None or self.limit_mm is None:
+            return None
+        value, u = abs(self.value_mm or 0.0), (self.expanded_uncertainty_mm or 0.0) / 2
+        if u == 0:
+            return float(value > self.limit_mm)
+        above, below = ((side * value + self.limit_mm) / (u * math.sqrt(2)) for side in (-1, 1))
+        return 0.5 * math.erfc(above) + 0.5 * math.erfc(below)
 
 
 @dataclass(frozen=True)
@@ -175,6 +248,8 @@ class Histogram:
     counts: NDArray[np.int64]
     kept: NDArray[np.bool_]
     step_mm: float
+    expanded_uncertainty_mm: float | None = None
+    """Of `step_mm`, k = 2; None: not stated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,10 +270,30 @@ class StepResult:
     """Expanded, k = 2, of each bin."""
     budget: tuple[BudgetLine, ...]
     harmonics_mm: dict[str, float]
-    """Fourier terms around the seam where the arc allows them: diameter difference, axis offset, ovality ..."""
-    angle_between_walls_deg: float
+    """Fourier terms around the seam where the arc allows them: `name`, `name_u` (expanded, k = 2), `name_at_deg`."""
+    angle_between_walls_deg: float | None
+    """None where the scan does not determine it."""
     coverage_deg: float
     """How much of the seam's turn was seen."""
+    angle_between_walls_u_deg: float | None = None
+    """Expanded, k = 2."""
+    not_observable: tuple[str, ...] = ()
+    """Names of what this scan does not determine: less than a pipe's tolerances do."""
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Which bins of the profile hold a number with its uncertainty; the others are no measurement."""
+        return np.isfinite(self.step_mm) & np.isfinite(self.u_mm)
+
+    @property
+    def seam_mean_mm(self) -> float | None:
+        """Mean step at the seam over the bins measured; None where there are none."""
+        return float(self.step_mm[self.measured].mean()) if self.measured.any() else None
+
+    @property
+    def seam_mean_u_mm(self) -> float | None:
+        """Its expanded uncertainty, k = 2: the mean of the bins' own, as if they shared all of it; it is not more."""
+        return float(self.u_mm[self.measured].mean()) if self.measured.any() else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -405,6 +500,33 @@ class Inspection:
         order = (Verdict.FAIL, Verdict.NOT_MEASURED, Verdict.NOT_ASSESSABLE, Verdict.INCONCLUSIVE, Verdict.PASS)
         given = {judgement.verdict for judgement in self.verdicts}
         return next((verdict for verdict in order if verdict in given), Verdict.NOT_MEASURED)
+
+    @property
+    def headline(self) -> Judgement | None:
+        """The judgement that the verdict is: of those with the worst verdict, the one of least margin."""
+        worst = [judgement for judgement in self.verdicts if judgement.verdict == self.verdict]
+        # What has no margin has no number: it comes before what has one.
+        return min(worst, key=lambda j: -math.inf if j.margin is None else j.margin, default=None)
+
+    @property
+    def seen_deg(self) -> float:
+        """How much of the seam's turn was seen."""
+        if self.coverage is not None:
+            return self.coverage.seen_deg
+        return 0.0 if self.step is None else self.step.coverage_deg
+
+    @property
+    def whole(self) -> bool:
+        """Whether the whole turn was seen."""
+        return self.seen_deg >= WHOLE_TURN_DEG - 1e-6
+
+    def words(self, verdict: Verdict | None = None) -> str:
+        """A verdict as it is said: `PASS over 54° of 360°` where not the whole seam was seen; by default the one."""
+        verdict = self.verdict if verdict is None else verdict
+        if verdict is not Verdict.PASS or self.whole:
+            return verdict.value
+        # Rounded down: no more is claimed than was seen.
+        return f"{verdict.value} over {math.floor(self.seen_deg + 1e-6)}° of 360°"
 
 
 # --- the scanner's calibration ----------------------------------------------------------------------------------------
@@ -721,8 +843,9 @@ class Verification:
 class Standing:
     """Whether an inspection may rely on its scanner: what the history of verifications says."""
 
-    good: bool
-    """No verification is asked for, or the last one of this scanner passed and is still valid."""
+    state: Literal["verified", "failed", "expired", "none"]
+    """`verified`: the last verification of this scanner passed and is valid; `expired`: it passed once; `none`: none is
+    on record, and none was asked for; `failed`: everything else, a history that names another scanner too."""
     text: str
     history: str | None = None
     id: str | None = None
@@ -734,13 +857,18 @@ class Standing:
     notes: tuple[str, ...] = ()
 
     @property
+    def good(self) -> bool:
+        """The last verification of this scanner passed and is still valid."""
+        return self.state == "verified"
+
+    @property
     def relied_on(self) -> bool:
-        """Whether results of this scanner are judged."""
-        return self.good or self.accepted is not None
+        """Whether results of this scanner are judged: where no verification is asked for, too."""
+        return self.state in ("verified", "none") or self.accepted is not None
 
     @property
     def statement(self) -> str:
         """What a report says."""
         if self.accepted is None:
-            return self.text if self.good else f"not relied on: {self.text}"
+            return self.text if self.relied_on else f"not relied on: {self.text}"
         return f"relied on all the same ({self.accepted}); {self.text}"

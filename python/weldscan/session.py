@@ -279,6 +279,8 @@ class PartSpec(_Model):
     machined_after_welding: bool = False
     side: Literal["welding", "opposite"] = "welding"
     """Which side of the joint was scanned."""
+    required_coverage_deg: Annotated[float, Field(gt=0, le=360)] | None = None
+    """How much of the seam must be seen for a PASS; 360: all of it."""
 
     @model_validator(mode="after")
     def _is_a_pipe(self) -> Self:

@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from weldscan import terminal
 from weldscan.errors import InputError
 
 if TYPE_CHECKING:
     from weldscan.calibration.plan import Plan
+    from weldscan.response import Response
     from weldscan.result import HandEye, ScannerCalibration
 
 Tell = Callable[[int, int, str], None]
@@ -80,9 +82,10 @@ def hand_eye(
         found = solve(session, progress, left_out)
     write_hand_eye(out, found)
     write_hand_eye_page(found, page, session.resolve().name)
-    _show_hand_eye(found, left_out)
-    print(f'         kept in {out}; a session carries it as "hand_eye": "{out.name}"')
-    print(f"         page: {page}")
+    with terminal.answer():
+        _show_hand_eye(found, left_out)
+        print(f'         kept in {out}; a session carries it as "hand_eye": "{out.name}"')
+        print(f"         page: {page}")
 
 
 @calibrate.command(
@@ -158,9 +161,10 @@ def plan(
         )
     planning.write_plan(out, planning.document(given, found))
     write_plan_page(found, page, given.name)
-    _show_plan(found)
-    print(f'plan: {out}; [scan] plan = "{out.name}" in cell.toml, then weldscan scan, weldscan calibrate hand-eye')
-    print(f"page: {page}")
+    with terminal.answer():
+        _show_plan(found)
+        print(f'plan: {out}; [scan] plan = "{out.name}" in cell.toml, then weldscan scan, weldscan calibrate hand-eye')
+        print(f"page: {page}")
 
 
 def _show_plan(found: Plan) -> None:
@@ -273,7 +277,8 @@ def scanner(
         )
     write_scanner(out, found)
     write_scanner_page(found, page)
-    _say(found, out, page)
+    with terminal.answer():
+        _say(found, out, page)
 
 
 def _say(found: ScannerCalibration, out: Path, page: Path) -> None:
@@ -347,6 +352,12 @@ def response(
     write_response(out, found)
     picture = out.with_suffix(".svg")
     picture.write_text(response_svg(found), encoding="utf-8")
+    with terminal.answer():
+        _show_response(found, out, picture)
+
+
+def _show_response(found: Response, out: Path, picture: Path) -> None:
+    """How far from proportional the light is, and what that does to a phase."""
     seen = {"ramp": "even images", "harmonics": "the fringes' harmonics", "phase": "the error of the fringes' phase"}
     print(f"response {found.document()['id']} from {seen[found.method]}: like a gamma of {found.gamma:.3f}")
     for entry in found.fringes:

@@ -32,7 +32,7 @@ Progress: TypeAlias = Callable[[int, int, str], None]
 REFERENCE_WALL, OTHER_WALL, BEAD, PLATE, STEM, SPHERE = 1, 2, 3, 4, 5, 6
 Target: TypeAlias = Literal["artefact", "part", "plane"]
 """What a shot is of."""
-# Profile bins as in `weldscan-result/1`: 2 degrees, centred on even degrees.
+# Profile bins as in `weldscan-result/2`: 2 degrees, centred on even degrees.
 BIN_DEG = 2
 BIN_MM = 0.005
 """Bins of the histogram whose highest one is the mode."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
@@ -17,7 +17,7 @@ from importlib import resources
 from typing import Any
 
 from weldscan.errors import InputError
-from weldscan.result import Judgement, Verdict
+from weldscan.result import WHOLE_TURN_DEG, Finding, Judgement, Severity, Verdict, bar
 
 EVIDENCE = {
     "V": "read in a source",
@@ -25,6 +25,8 @@ EVIDENCE = {
     "M": "unverified: from memory",
 }
 MM = {"mm": Fraction(1), "in": Fraction(254, 10)}
+# How many bars a verdict's reason names; the result lists them all.
+NAMED_BARS = 2
 
 
 @dataclass(frozen=True)
@@ -187,12 +189,14 @@ def judge(
     coverage_deg: float | None = None,
     required_coverage_deg: float | None = None,
     guard_factor: float = 1.0,
+    bars: Iterable[Finding] = (),
 ) -> tuple[Judgement, ...]:
     """The verdict of one norm on a measured step, by the decision rule of ISO 14253-1.
 
     With the guard band g = `guard_factor` x U: PASS where |h| <= L - g, FAIL where |h| > L + g, INCONCLUSIVE between.
     What lies outside the norm's scope is NOT ASSESSABLE; what has no value is NOT MEASURED; a value without an
-    uncertainty never passes.
+    uncertainty never passes. Too little of the seam, or a finding that bars, turns PASS into INCONCLUSIVE and leaves
+    every other verdict as it is.
 
     Args:
         norm_id: one of `norm_ids()`.
@@ -204,6 +208,10 @@ def judge(
         coverage_deg: how much of the seam's turn was seen; shown with the verdict.
         required_coverage_deg: a seam of which less was seen does not pass (it can still fail).
         guard_factor: 1 is the rule's default.
+        bars: findings of the inspection; those of severity `bar` count, the others change nothing.
+
+    Returns:
+        One judgement; its `barred_by` says what kept the number from being a PASS.
 
     Raises:
         InputError: no such norm.
@@ -238,7 +246,7 @@ def judge(
 
     limit = None
 
-    def verdict(verdict: Verdict, reason: str) -> tuple[Judgement, ...]:
+    def verdict(verdict: Verdict, reason: str, barred_by: tuple[Finding, ...] = ()) -> tuple[Judgement, ...]:
         return (
             Judgement(
                 norm=norm_id,
@@ -249,6 +257,7 @@ def judge(
                 verdict=verdict,
                 reason=reason,
                 details=details,
+                barred_by=barred_by,
             ),
         )
 
@@ -288,14 +297,31 @@ def judge(
     about = f"{abs(value):.3f} mm ± {uncertainty:.3f} mm (k = 2) against {limit:.3f} mm"
     if step > high:
         return verdict(Verdict.FAIL, f"{about}: above the limit by more than the guard band{seen}")
-    if required_coverage_deg is not None and (coverage_deg is None or coverage_deg < required_coverage_deg):
-        return verdict(
-            Verdict.NOT_MEASURED,
-            f"only {coverage_deg or 0:.0f}° of the seam were seen, {required_coverage_deg:.0f}° are required: {about}",
-        )
-    if step <= low:
-        return verdict(Verdict.PASS, f"{about}: below the limit by at least the guard band{seen}")
-    return verdict(Verdict.INCONCLUSIVE, f"{about}: nearer to the limit than the guard band{seen}")
+    if step > low:
+        return verdict(Verdict.INCONCLUSIVE, f"{about}: nearer to the limit than the guard band{seen}")
+    below = f"{about}: below the limit by at least the guard band{seen}"
+    barred = _barred(bars, coverage_deg, required_coverage_deg)
+    if not barred:
+        return verdict(Verdict.PASS, below)
+    named = "; ".join(str(each) for each in barred[:NAMED_BARS])
+    more = f"; and {len(barred) - NAMED_BARS} more" if len(barred) > NAMED_BARS else ""
+    return verdict(Verdict.INCONCLUSIVE, f"would be PASS but for {named}{more} ({below})", barred)
+
+
+def _barred(findings: Iterable[Finding], seen_deg: float | None, required_deg: float | None) -> tuple[Finding, ...]:
+    """What bars PASS: the findings that do, and too little of the seam, where none of them says so already."""
+    barred = tuple(each for each in findings if each.severity is Severity.BAR)
+    if required_deg is None or (seen_deg is not None and seen_deg >= required_deg):
+        return barred
+    if any(each.code == "coverage" for each in barred):
+        return barred
+    required = "the whole seam is" if required_deg >= WHOLE_TURN_DEG else f"{required_deg:g}° are"
+    seen = (
+        "it is not known how much of the seam was seen"
+        if seen_deg is None
+        else f"{seen_deg:.0f}° of the seam were seen"
+    )
+    return (bar("coverage", f"{seen}, {required} required"), *barred)
 
 
 def _thicknesses(part: Mapping[str, Any]) -> tuple[float, ...]:

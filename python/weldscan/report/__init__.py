@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -18,22 +16,75 @@ import numpy as np
 
 from weldscan._weldcore import __version__
 from weldscan.report import charts, page, pictures
-from weldscan.result import ArtefactShot, HandEye, Inspection, Judgement, Label, PartCloud, StepResult, Verdict
-from weldscan.session import plain, to_json, whole_folder
+from weldscan.report.document import (
+    CLASSES,
+    SCHEMA,
+    artefact_shot,
+    counts,
+    headline_text,
+    judgement_text,
+    profile_csv,
+    read_result,
+    report_id,
+    result_document,
+)
+from weldscan.result import (
+    Finding,
+    HandEye,
+    Inspection,
+    Judgement,
+    PartCloud,
+    Severity,
+    StepResult,
+    Verdict,
+)
+from weldscan.session import to_json, whole_folder
 
-SCHEMA = "weldscan-result/1"
+__all__ = [
+    "CLASSES",
+    "FILES",
+    "ICONS",
+    "SCHEMA",
+    "artefact_shot",
+    "counts",
+    "headline_text",
+    "html",
+    "is_result",
+    "judgement_text",
+    "part_line",
+    "profile_csv",
+    "read_result",
+    "report_id",
+    "result_document",
+    "write_ply",
+    "write_report",
+]
 FILES = ("result.json", "report.html", "profile.csv", "cloud.ply")
-CLASSES = {
-    "reference_wall": Label.REFERENCE_WALL,
-    "other_wall": Label.OTHER_WALL,
-    "bead": Label.BEAD,
-}
 ICONS = {
     Verdict.PASS: "M16 28 L24 36 L39 19",
     Verdict.FAIL: "M18 18 L36 36 M36 18 L18 36",
     Verdict.INCONCLUSIVE: "M20 21 Q20 14 27 14 Q34 14 34 21 Q34 26 27 29 L27 32 M27 40 L27 40.2",
     Verdict.NOT_MEASURED: "M17 27 L37 27",
     Verdict.NOT_ASSESSABLE: "M17 27 L37 27",
+}
+ORDER = (Severity.BAR, Severity.WARNING, Severity.NOTE)
+# How many angles a line names before it is cut short.
+SHOWN_PLACES = 8
+# PASS of a part of the seam: a smaller tick on a piece of the ring.
+PART_ICON = "M19 28 L25 34 L36 22 M27 9 A18 18 0 0 1 45 27"
+FATE_NAMES = {
+    "wall": "wall",
+    "transition": "between wall and cap",
+    "cap": "cap",
+    "gated": "too far from any wall",
+    "off_line": "camera and projector disagree",
+    "dark": "dark",
+    "saturated": "saturated",
+    "order_in_doubt": "fringe order in doubt",
+    "two_paths": "light on two paths",
+    "outside_calibration": "outside the calibrated volume",
+    "hidden": "hidden",
+    "other": "neither wall nor cap",
 }
 
 
@@ -45,7 +96,7 @@ def write_report(inspection: Inspection, out_dir: str | os.PathLike[str]) -> Pat
         out_dir: must not exist yet, be empty, or be an earlier result, which is replaced once the new one is complete.
 
     Returns:
-        The folder, with `result.json` (schema `weldscan-result/1`), `report.html` (self-contained), `profile.csv` and
+        The folder, with `result.json` (schema `weldscan-result/2`), `report.html` (self-contained), `profile.csv` and
         `cloud.ply`. The last two are there even where nothing was measured, then without rows.
 
     Raises:
@@ -57,7 +108,7 @@ def write_report(inspection: Inspection, out_dir: str | os.PathLike[str]) -> Pat
     with whole_folder(out, is_result) as folder, ThreadPoolExecutor(1) as beside:
         # Most of it is copying, which the interpreter can do while the pictures are drawn.
         cloud = beside.submit(write_ply, folder / "cloud.ply", inspection.cloud)
-        (folder / "profile.csv").write_text(profile_csv(inspection.step), encoding="utf-8")
+        (folder / "profile.csv").write_text(profile_csv(inspection.step, inspection.part), encoding="utf-8")
         (folder / "result.json").write_text(to_json(result_document(inspection, created)), encoding="utf-8")
         (folder / "report.html").write_text(html(inspection, created), encoding="utf-8")
         cloud.result()
@@ -83,145 +134,7 @@ def is_result(folder: Path) -> bool:
     return names <= set(FILES) and str(schema).startswith("weldscan-result/")
 
 
-def report_id(inspection: Inspection, created: datetime) -> str:
-    """A number that no other report has: the day, and a hash of the session and the moment."""
-    text = f"{inspection.session}|{inspection.software.get('session_sha256', '')}|{created.isoformat()}"
-    return f"{created:%Y%m%d}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
-
-
 # --- the files --------------------------------------------------------------------------------------------------------
-
-
-def result_document(inspection: Inspection, created: datetime) -> dict[str, Any]:
-    """`weldscan-result/1` as plain data; what has no value is null, never NaN."""
-    step, hand_eye = inspection.step, inspection.hand_eye
-    document = {
-        "schema": SCHEMA,
-        "report": report_id(inspection, created),
-        "created": created.isoformat(timespec="seconds"),
-        "session": inspection.session,
-        "part": inspection.part,
-        "frame": inspection.frame,
-        "method": inspection.method,
-        "verdict": inspection.verdict,
-        "judged_mm": inspection.judged_mm,
-        "step_mm": _step(step),
-        "profile": _profile(step),
-        "uncertainty_budget": [
-            {"name": line.name, "standard_mm": line.standard_mm, "derived_from": line.derived_from}
-            for line in (step.budget if step else ())
-        ],
-        "scanner": None if inspection.scanner is None else vars(inspection.scanner),
-        "hand_eye": _hand_eye(hand_eye),
-        "agreement": [vars(pair) for pair in inspection.agreement],
-        "counts": counts(inspection.cloud),
-        "verdicts": [_judgement(judgement) for judgement in inspection.verdicts],
-        "verification": None if inspection.verification is None else vars(inspection.verification),
-        "left_out": [{"shot": shot, "reason": reason} for shot, reason in inspection.left_out],
-        "warnings": list(inspection.warnings),
-        "masks": inspection.masks,
-        "response": inspection.response,
-        "timing_s": inspection.timing_s,
-        "software": {"version": __version__, **inspection.software},
-    }
-    result: dict[str, Any] = plain(document)
-    return result
-
-
-def _step(step: StepResult | None) -> dict[str, Any]:
-    histogram = step.histogram if step else None
-    return {
-        "mean": step.mean_mm if step else None,
-        "median": step.median_mm if step else None,
-        "max_abs": step.max_abs_mm if step else None,
-        "max_abs_at_deg": step.max_abs_at_deg if step else None,
-        "expanded_uncertainty": step.expanded_uncertainty_mm if step else None,
-        "histogram": histogram.step_mm if histogram else None,
-        "coverage_deg": step.coverage_deg if step else 0.0,
-        "angle_between_walls_deg": step.angle_between_walls_deg if step else None,
-        "harmonics": step.harmonics_mm if step else {},
-    }
-
-
-def _profile(step: StepResult | None) -> list[dict[str, Any]]:
-    if step is None:
-        return []
-    rows = zip(step.angle_deg.tolist(), step.step_mm.tolist(), step.u_mm.tolist(), strict=True)
-    return [{"angle_deg": angle, "step_mm": value, "u_mm": u} for angle, value, u in rows]
-
-
-def _hand_eye(hand_eye: HandEye | None) -> dict[str, Any] | None:
-    if hand_eye is None:
-        return None
-    return {
-        "id": hand_eye.id,
-        "date": hand_eye.date,
-        "flange_from_scanner": hand_eye.flange_from_scanner,
-        "covariance": hand_eye.covariance,
-        "residual_rms_mm": hand_eye.residual_rms_mm,
-        "reduced_chi2": hand_eye.reduced_chi2,
-        "working_point_u_mm": hand_eye.working_point_u_mm,
-        "pose_sigma_mm": hand_eye.pose_sigma_mm,
-        "pose_sigma_rad": hand_eye.pose_sigma_rad,
-        "sphere_sigma_ratio": hand_eye.sphere_sigma_ratio,
-        "probe_bias_mm": hand_eye.probe_bias_mm,
-        "probe_bias_u_mm": hand_eye.probe_bias_u_mm,
-        "tilts_deg": hand_eye.tilts_deg,
-        "warnings": hand_eye.warnings,
-        "touched_distances_mm": hand_eye.touched_distances_mm,
-        "per_shot": [artefact_shot(shot) for shot in hand_eye.per_shot],
-    }
-
-
-def artefact_shot(shot: ArtefactShot) -> dict[str, Any]:
-    """One row of `hand_eye.per_shot`."""
-    return {
-        "shot": shot.shot,
-        "residual_rms_mm": shot.residual_rms_mm,
-        "left_out_error_mm": shot.left_out_error_mm,
-        "chi2": shot.chi2,
-        "outlier": shot.outlier,
-        "distances_mm": shot.distances_mm,
-        "spheres": [
-            {
-                "centre_mm": sphere.centre_mm,
-                "covariance_mm2": sphere.covariance_mm2,
-                "rms_mm": sphere.rms_mm,
-                "points": sphere.points,
-                "residual_mm": sphere.residual_mm,
-            }
-            for sphere in shot.spheres
-        ],
-    }
-
-
-def _judgement(judgement: Judgement) -> dict[str, Any]:
-    return {
-        "norm": judgement.norm,
-        "clause": judgement.clause,
-        "limit_mm": judgement.limit_mm,
-        "value_mm": judgement.value_mm,
-        "expanded_uncertainty_mm": judgement.expanded_uncertainty_mm,
-        "verdict": judgement.verdict,
-        "reason": judgement.reason,
-        "details": judgement.details,
-    }
-
-
-def counts(cloud: PartCloud | None) -> dict[str, int]:
-    """How many points there are, in all and per class."""
-    label = np.zeros(0, np.uint8) if cloud is None else cloud.label
-    per_label = np.bincount(label, minlength=len(Label))
-    return {"points": int(label.size)} | {name: int(per_label[value]) for name, value in CLASSES.items()}
-
-
-def profile_csv(step: StepResult | None) -> str:
-    """The profile as rows of text."""
-    text = io.StringIO()
-    text.write("angle_deg,step_mm,u_mm\n")
-    for row in _profile(step):
-        text.write(f"{row['angle_deg']:g},{row['step_mm']:.5f},{row['u_mm']:.5f}\n")
-    return text.getvalue()
 
 
 def write_ply(path: Path, cloud: PartCloud | None) -> None:
@@ -261,17 +174,18 @@ def _page(inspection: Inspection, created: datetime, view: Future[str | None], u
     from markupsafe import Markup
 
     step, cloud, hand_eye = inspection.step, inspection.cloud, inspection.hand_eye
-    worst = next((j for j in inspection.verdicts if j.verdict == inspection.verdict), None)
-    limits = [j.limit_mm for j in inspection.verdicts if j.limit_mm is not None]
-    limit = worst.limit_mm if worst else min(limits, default=None)
-    judged_u = worst.expanded_uncertainty_mm if worst else None
+    headline = inspection.headline
+    judged_u = headline.expanded_uncertainty_mm if headline else None
     if judged_u is None and step is not None:
         judged_u = step.expanded_uncertainty_mm
+    guard = judged_u if judged_u is not None and math.isfinite(judged_u) else 0.0
+    bars = _grouped(inspection.bars)
+    marks = [charts.Mark(at, number) for number, group in enumerate(bars, 1) for at in group.places_deg]
     drawings: dict[str, Any] = dict.fromkeys(("step_chart", "clock", "map_chart", "histogram_chart"))
-    if step is not None and step.angle_deg.size:
-        judged = None if inspection.judged_mm is None or judged_u is None else (inspection.judged_mm, judged_u)
-        drawings["step_chart"] = charts.step_chart(step, limit, judged)
-        drawings["clock"] = charts.clock(step)
+    if inspection.seam or (step is not None and step.measured.any()):
+        limits = _limits(inspection.verdicts, guard)
+        drawings["step_chart"] = charts.seam_chart(step, limits, guard, inspection.seam, inspection.coverage, marks)
+        drawings["clock"] = charts.clock(step, inspection.seen_deg, inspection.seam, inspection.coverage, marks)
     if step is not None and step.histogram is not None:
         drawings["histogram_chart"] = charts.histogram_chart(step.histogram)
     drawings["map_chart"] = unrolled.result()
@@ -284,10 +198,23 @@ def _page(inspection: Inspection, created: datetime, view: Future[str | None], u
         s=step,
         h=hand_eye,
         report_id=report_id(inspection, created),
-        verdict=inspection.verdict.value,
-        icon=ICONS[inspection.verdict],
-        why=worst.reason if worst else "no norm was asked",
-        limit=limit,
+        words=inspection.words(),
+        tone=_tone(inspection, inspection.verdict),
+        icon=PART_ICON if _tone(inspection, inspection.verdict) == "PART" else ICONS[inspection.verdict],
+        headline=headline,
+        tags=[
+            (judgement, inspection.words(judgement.verdict), _tone(inspection, judgement.verdict))
+            for judgement in inspection.verdicts
+        ],
+        bars=bars,
+        findings=sorted(inspection.findings, key=lambda finding: ORDER.index(finding.severity)),
+        seen_deg=math.floor(inspection.seen_deg + 1e-6),
+        over=_over,
+        warnings=[finding for finding in inspection.findings if finding.severity is Severity.WARNING],
+        notes=[finding for finding in inspection.findings if finding.severity is Severity.NOTE],
+        fates=[
+            (name, text) for name, text in FATE_NAMES.items() if any(each.fate.get(name) for each in inspection.seam)
+        ],
         judged_u=judged_u,
         judged_where=_where(inspection),
         part_line=part_line(inspection.part),
@@ -306,6 +233,62 @@ def _page(inspection: Inspection, created: datetime, view: Future[str | None], u
         signed=lambda value: f"{value:+.3f}".replace("-", "−"),
         **{name: None if text is None else Markup(text) for name, text in drawings.items()},
     )
+
+
+@dataclass(frozen=True)
+class BarGroup:
+    """Bars of one code in one shot, told as one."""
+
+    code: str
+    shot: str | None
+    texts: tuple[str, ...]
+    places_deg: tuple[float, ...]
+
+    @property
+    def places(self) -> str:
+        """Shot and angles in words."""
+        angles = [f"{at:.0f}°" for at in self.places_deg]
+        shown = (
+            ", ".join(angles)
+            if len(angles) <= SHOWN_PLACES
+            else f"{', '.join(angles[: SHOWN_PLACES - 1])} … {angles[-1]}"
+        )
+        return ", ".join(([self.shot] if self.shot else []) + ([f"at {shown}"] if shown else []))
+
+
+def _grouped(bars: Sequence[Finding]) -> list[BarGroup]:
+    groups: dict[tuple[str, str | None], list[Finding]] = {}
+    for each in bars:
+        groups.setdefault((each.code, each.shot), []).append(each)
+    return [
+        BarGroup(
+            code,
+            shot,
+            tuple(dict.fromkeys(each.text for each in found)),
+            tuple(sorted({each.at_deg for each in found if each.at_deg is not None})),
+        )
+        for (code, shot), found in groups.items()
+    ]
+
+
+def _tone(inspection: Inspection, verdict: Verdict) -> str:
+    """The colour's name: PASS of the whole seam is green, of a part of it something else."""
+    if verdict is Verdict.PASS and not inspection.whole:
+        return "PART"
+    return verdict.value.split()[0]
+
+
+def _limits(judgements: Sequence[Judgement], guard_mm: float) -> list[charts.Limit]:
+    """Every limit that was judged by, once, with whose it is."""
+    whose: dict[float, list[str]] = {}
+    for each in judgements:
+        if each.limit_mm is not None:
+            whose.setdefault(each.limit_mm, []).append(f"{each.norm}{f' ({each.doubt})' if each.doubt else ''}")
+    band = f" ± {guard_mm:.3f}" if guard_mm else ""
+    return [
+        charts.Limit(value, f"limit {charts.number(value)}{band} mm: {', '.join(dict.fromkeys(names))}")
+        for value, names in sorted(whose.items())
+    ]
 
 
 def part_line(part: Mapping[str, Any]) -> str:
@@ -344,22 +327,28 @@ def _classes(cloud: PartCloud | None) -> list[tuple[str, str, int]]:
     return [(name.replace("_", " "), pictures.COLOURS[label], found[name]) for name, label in CLASSES.items()]
 
 
-def _harmonics(step: StepResult | None) -> list[tuple[str, str]]:
-    """`name`, with `name_u` as its expanded uncertainty and `name_at_deg` as its direction, where they are given."""
+def _harmonics(step: StepResult | None) -> list[tuple[str, str | None]]:
+    """Each term with its expanded uncertainty (`name_u`) and direction (`name_at_deg`); None: not observable."""
     terms = step.harmonics_mm if step else {}
-    shown = []
+    shown: list[tuple[str, str | None]] = []
     for name, value in terms.items():
         if name.endswith(("_u", "_at_deg")):
             continue
         u, at = terms.get(f"{name}_u"), terms.get(f"{name}_at_deg")
+        # Without its uncertainty a number is no result.
         text = (
-            f"{value:.3f}"
-            + (f" ± {u:.3f}" if u is not None else "")
-            + " mm"
-            + (f" at {at:.0f}°" if at is not None else "")
+            None if u is None else f"{value:.3f} ± {u:.3f} mm{'' if at is None else f' at {at:.0f}°'}".replace("-", "−")
         )
-        shown.append((name.replace("_", " "), text.replace("-", "−")))
-    return shown
+        shown.append((name.replace("_", " "), text))
+    missing = () if step is None else step.not_observable
+    return shown + [(name.replace("_", " "), None) for name in missing if name != "angle_between_walls"]
+
+
+def _over(probability: float) -> str:
+    """The probability of a step above the limit, in words that claim no digits that a tail does not have."""
+    if probability < 1e-4:
+        return "P(over) < 0.01 %"
+    return "P(over) > 99.99 %" if probability > 1 - 1e-4 else f"P(over) {100 * probability:.2g} %"
 
 
 def _matrix(hand_eye: HandEye | None) -> str:
@@ -418,11 +407,21 @@ def _response_line(response: Mapping[str, Any]) -> str:
     return str(response["note"] or "no error of the phase above the noise; nothing was compensated")
 
 
+def _plain_mean(step: StepResult) -> tuple[str, str]:
+    return (
+        "mean, median over the other wall's points",
+        f"{step.mean_mm:.3f} mm, {step.median_mm:.3f} mm; without uncertainty, judged by nothing",
+    )
+
+
 def _record(inspection: Inspection) -> list[tuple[str, str]]:
     part = [(f"part: {name}", str(value)) for name, value in inspection.part.items() if value is not None]
     timing = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in inspection.timing_s.items())
+    mean = [] if inspection.step is None else [_plain_mean(inspection.step)]
     return [
         ("method judged", inspection.method),
+        ("scanner's calibration in U", inspection.calibration),
+        *mean,
         ("frame of the cloud", inspection.frame),
         ("verification of the scanner", _standing(inspection)),
         *part,

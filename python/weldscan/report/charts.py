@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from html import escape
 
 import numpy as np
 
 from weldscan.report.pictures import Extent, diverging
-from weldscan.result import Histogram, StepResult
+from weldscan.result import FATES, Coverage, Histogram, SeamBin, StepResult
 
 WIDTH = 960
 LEFT, RIGHT = 64, 24
 GAP = 26  # between two arcs of the seam
+BIN_DEG = 2.0  # of the profile and of the seam
 
 
 def _short(value: object) -> str:
@@ -101,7 +103,9 @@ def number(value: float) -> str:
     return f"{value:g}".replace("-", "−")
 
 
-def arcs_of(angles_deg: Sequence[float], bin_deg: float = 2.0, bridge_deg: float = 8.0) -> list[tuple[float, float]]:
+def arcs_of(
+    angles_deg: Sequence[float], bin_deg: float = BIN_DEG, bridge_deg: float = 8.0
+) -> list[tuple[float, float]]:
     """The arcs that occupied bins make, (start, end) with an end perhaps beyond 360."""
     # Gaps up to `bridge_deg` do not part an arc.
     bins = np.unique(np.rint(np.mod(np.asarray(angles_deg, float), 360) / bin_deg).astype(int) % round(360 / bin_deg))
@@ -142,7 +146,17 @@ class AngleAxis:
                 return index, self.places[index][0] + along * self.scale
         return None
 
-    def draw(self, svg: Svg, top: float, bottom: float) -> None:
+    def spans(self, start_deg: float, end_deg: float) -> Iterator[tuple[float, float]]:
+        """Where an arc, in the direction of growing angle, lies on the page: (x, width) of each piece."""
+        length = (end_deg - start_deg) % 360 or 360.0
+        for (start, end), (x, _) in zip(self.arcs, self.places, strict=True):
+            for turn in (-360, 0, 360):
+                low = max(start, start_deg % 360 + turn)
+                high = min(end, start_deg % 360 + length + turn)
+                if high > low + 1e-6:
+                    yield x + (low - start) * self.scale, (high - low) * self.scale
+
+    def draw(self, svg: Svg, top: float, bottom: float, degrees: bool = True) -> None:
         """Frames, grid lines and degrees below."""
         span = sum(end - start for start, end in self.arcs)
         step = next(step for step in (2, 5, 10, 15, 30, 45, 60) if span / step <= 16)
@@ -151,69 +165,214 @@ class AngleAxis:
             for tick in range(math.ceil(start / step) * step, math.floor(end) + 1, step):
                 at = x + (tick - start) * self.scale
                 svg.line(at, top, at, bottom, "grid")
-                svg.text(at, bottom + 17, f"{tick % 360 if tick != 360 else 360}°", "tick")
-        svg.text((LEFT + WIDTH - RIGHT) / 2, bottom + 37, "angle about the pipe's axis, from the zero mark", "axis")
+                if degrees:
+                    svg.text(at, bottom + 17, f"{tick % 360 if tick != 360 else 360}°", "tick")
+        if degrees:
+            svg.text((LEFT + WIDTH - RIGHT) / 2, bottom + 37, "angle about the pipe's axis, from the zero mark", "axis")
 
 
-def step_chart(step: StepResult, limit_mm: float | None, judged: tuple[float, float] | None) -> str:
-    """Step over angle with its uncertainty band, the limits and their guard bands; `judged` is (value, U)."""
-    height, top, bottom = 390, 20, 330
-    svg = Svg(WIDTH, height, "Step around the seam, with limit and guard band")
-    angles = AngleAxis(arcs_of(step.angle_deg.tolist()))
-    guard = judged[1] if judged else 0.0
-    u_mm = np.nan_to_num(step.u_mm, posinf=0.0)
-    highest = float(np.nanmax(step.step_mm + u_mm, initial=0.0))
-    lowest = float(np.nanmin(step.step_mm - u_mm, initial=0.0))
-    if limit_mm is not None:
-        # The side of the limit that matters is always shown; the other one where the step comes near it.
-        highest = max(highest, limit_mm + guard) if highest > 0.25 * -lowest else highest
-        lowest = (
-            min(lowest, -limit_mm - guard) if -lowest > 0.25 * max(highest, 0) and lowest < -0.3 * limit_mm else lowest
-        )
+@dataclass(frozen=True)
+class Limit:
+    """One line to draw: a limit and whose it is."""
+
+    value_mm: float
+    label: str
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Where something bars the verdict, and under which number the page lists it."""
+
+    at_deg: float
+    number: int
+
+
+def seam_chart(
+    step: StepResult | None,
+    limits: Sequence[Limit] = (),
+    guard_mm: float = 0.0,
+    seam: Sequence[SeamBin] = (),
+    coverage: Coverage | None = None,
+    marks: Sequence[Mark] = (),
+) -> str:
+    """Step over angle with its uncertainty and every limit; below it, to the same scale, what became of the pixels.
+
+    What was required and not seen is hatched, and no line runs across it; what bars the verdict is a red column.
+    """
+    known = [] if step is None else step.angle_deg[step.measured].tolist()
+    angles = AngleAxis(arcs_of([*known, *(each.angle_deg for each in seam)]))
+    top, bottom = 26, 330 if known else 26
+    strip = (bottom + (12 if known else 0), bottom + (64 if known else 60)) if seam else None
+    end = strip[1] if strip else bottom
+    svg = Svg(WIDTH, end + 48, "Step around the seam, with limits, and what became of the pixels")
+    svg.parts.append(
+        '<defs><pattern id="unseen" width="7" height="7" patternUnits="userSpaceOnUse" patternTransform="rotate(45)">'
+        '<rect width="7" height="7" class="hatch-back"/><line x1="0" y1="0" x2="0" y2="7" class="hatch"/>'
+        "</pattern></defs>"
+    )
+    panels = [(top, bottom)] if known else []
+    if known:
+        angles.draw(svg, top, bottom, degrees=strip is None)
+    if strip:
+        angles.draw(svg, *strip)
+        _draw_fates(svg, angles, seam, *strip)
+        panels.append(strip)
+    for arc in unseen_arcs(seam, coverage) if known else ():
+        for x, width in angles.spans(*arc):
+            svg.add("rect", x=x, y=float(top), width=width, height=float(bottom - top), fill="url(#unseen)")
+            if width > 60:
+                svg.text(x + width / 2, (top + bottom) / 2, "not seen", "unseen-label")
+    for upper, lower in panels:
+        for mark in marks:
+            for x, width in angles.spans(mark.at_deg - BIN_DEG / 2, mark.at_deg + BIN_DEG / 2):
+                wide = max(width, 5.0)
+                svg.add(
+                    "rect",
+                    x=x + width / 2 - wide / 2,
+                    y=float(upper),
+                    width=wide,
+                    height=float(lower - upper),
+                    class_="bar-column",
+                )
+    if step is not None and known:
+        _draw_step(svg, angles, step, limits, guard_mm, top, bottom)
+    _draw_numbers(svg, angles, marks, top - 6)
+    return str(svg)
+
+
+def _draw_step(
+    svg: Svg, angles: AngleAxis, step: StepResult, limits: Sequence[Limit], guard_mm: float, top: float, bottom: float
+) -> None:
+    some = step.measured
+    angle, value, u = step.angle_deg[some], step.step_mm[some], step.u_mm[some]
+    highest, lowest = max(float((value + u).max()), 0.0), min(float((value - u).min()), 0.0)
+    if limits:
+        # The side towards which the step leans shows every limit; the other one where the step comes near it.
+        furthest, nearest = (pick(limit.value_mm for limit in limits) for pick in (max, min))
+        up, down = highest >= -lowest, -lowest > highest
+        if up or highest > 0.5 * nearest:
+            highest = max(highest, furthest + guard_mm)
+        if down or -lowest > 0.5 * nearest:
+            lowest = min(lowest, -furthest - guard_mm)
     margin = 0.06 * (highest - lowest + 1e-9)
     low, high = lowest - margin, highest + margin
 
-    def y(value: float) -> float:
-        return bottom - (value - low) / (high - low) * (bottom - top)
+    def y(at: float) -> float:
+        return bottom - (at - low) / (high - low) * (bottom - top)
 
-    angles.draw(svg, top, bottom)
     svg.value_ticks(nice_ticks(low, high, 7), y)
     svg.upright(16, (top + bottom) / 2, "step, mm")
-    for limit in () if limit_mm is None else (limit_mm, -limit_mm):
-        if low <= limit <= high:
-            band = (y(min(limit + guard, high)), y(max(limit - guard, low)))
-            svg.add("rect", x=LEFT, y=band[0], width=WIDTH - LEFT - RIGHT, height=band[1] - band[0], class_="guard")
-            svg.line(LEFT, y(limit), WIDTH - RIGHT, y(limit), "limit")
-            svg.text(
-                LEFT + 8,
-                y(limit) - 6 - (y(limit) - band[0]),
-                f"limit {number(limit)} mm, guard band ± {guard:.3f} mm",
-                "limit-label",
-                "start",
-            )
+    shown = [(sign * each.value_mm, each) for each in limits for sign in (1, -1) if low <= sign * each.value_mm <= high]
+    for at, _ in shown:
+        band = (y(min(at + guard_mm, high)), y(max(at - guard_mm, low)))
+        svg.add("rect", x=LEFT, y=band[0], width=WIDTH - LEFT - RIGHT, height=band[1] - band[0], class_="guard")
+    taken: list[tuple[float, bool]] = []
+    for at, each in sorted(shown, key=lambda pair: pair[0]):
+        svg.line(LEFT, y(at), WIDTH - RIGHT, y(at), "limit")
+        # Two labels that would lie on each other go to either side.
+        right = any(abs(y(at) - other) < 15 and not aside for other, aside in taken)
+        taken.append((y(at), right))
+        side, anchor = (WIDTH - RIGHT - 8, "end") if right else (LEFT + 8, "start")
+        svg.text(side, y(at) - 5, each.label, "limit-label", anchor)
 
-    groups: dict[int, list[tuple[float, float, float]]] = {}
-    for angle, value, u in zip(step.angle_deg, step.step_mm, u_mm, strict=True):
-        place = angles(float(angle))
-        if place is not None and math.isfinite(value):
-            groups.setdefault(place[0], []).append((place[1], float(value), float(u)))
-    for points in groups.values():
-        points.sort()
-        upper, lower = [(x, y(v + u)) for x, v, u in points], [(x, y(v - u)) for x, v, u in points]
-        svg.path(upper + lower[::-1], "band", close=True)
-        svg.path([(x, y(v)) for x, v, _ in points], "curve")
-        for x, v, _ in points:
+    for run in _runs(angles, angle.tolist(), value.tolist(), u.tolist()):
+        if len(run) == 1:
+            x, v, half = run[0]
+            svg.line(x, y(v + half), x, y(v - half), "whisker")
+        else:
+            upper, lower = [(x, y(v + half)) for x, v, half in run], [(x, y(v - half)) for x, v, half in run]
+            svg.path(upper + lower[::-1], "band", close=True)
+            svg.path([(x, y(v)) for x, v, _ in run], "curve")
+        for x, v, _ in run:
             svg.add("circle", cx=x, cy=y(v), r=2.4, class_="dot")
     place = angles(step.max_abs_at_deg)
     if place is not None:
-        index = int(np.argmin(np.abs((step.angle_deg - step.max_abs_at_deg + 180) % 360 - 180)))
-        x, at = place[1], y(float(step.step_mm[index]))
+        index = int(np.argmin(np.abs((angle - step.max_abs_at_deg + 180) % 360 - 180)))
+        x, middle = place[1], y(float(value[index]))
         anchor, aside = ("end", -9) if x > WIDTH * 0.75 else ("start", 9)
-        svg.add("circle", cx=x, cy=at, r=5.5, class_="mark")
-        svg.text(
-            x + aside, at - 10, f"largest {step.max_abs_mm:.3f} mm at {step.max_abs_at_deg:.0f}°", "mark-label", anchor
-        )
-    return str(svg)
+        svg.add("circle", cx=x, cy=middle, r=5.5, class_="mark")
+        said = f"largest {step.max_abs_mm:.3f} mm at {step.max_abs_at_deg:.0f}°"
+        svg.text(x + aside, middle - 10, said, "mark-label", anchor)
+
+
+def _runs(
+    angles: AngleAxis, angle: Sequence[float], value: Sequence[float], u: Sequence[float]
+) -> Iterator[list[tuple[float, float, float]]]:
+    """The bins that stand side by side, as (x, value, U): a line through them crosses nothing that was not measured."""
+    places = sorted(
+        (place, v, half) for at, v, half in zip(angle, value, u, strict=True) if (place := angles(at)) is not None
+    )
+    run: list[tuple[float, float, float]] = []
+    arc = -1
+    for (index, x), v, half in places:
+        if run and (index != arc or x - run[-1][0] > 1.5 * BIN_DEG * angles.scale):
+            yield run
+            run = []
+        arc = index
+        run.append((x, v, half))
+    if run:
+        yield run
+
+
+def unseen_arcs(seam: Sequence[SeamBin], coverage: Coverage | None) -> list[tuple[float, float]]:
+    """What was required and not measured: the gaps, and the bins of the seam without a number.
+
+    Returns:
+        Arcs apart from each other, (start, end) with an end perhaps beyond 360; degrees.
+    """
+    arcs = [(each.angle_deg - BIN_DEG / 2, BIN_DEG) for each in seam if not each.measured]
+    arcs += [(start, (end - start) % 360 or 360.0) for start, end in (coverage.gaps if coverage else ())]
+    apart: list[tuple[float, float]] = []
+    for start, length in sorted((start % 360, length) for start, length in arcs):
+        if apart and start <= apart[-1][1] + 1e-6:
+            apart[-1] = (apart[-1][0], max(apart[-1][1], start + length))
+        else:
+            apart.append((start, start + length))
+    # The last may reach across the zero mark into the first ones.
+    while len(apart) > 1 and apart[-1][1] >= apart[0][0] + 360 - 1e-6:
+        first = apart.pop(0)
+        apart[-1] = (apart[-1][0], max(apart[-1][1], first[1] + 360))
+    if len(apart) == 1 and apart[0][1] - apart[0][0] >= 360 - 1e-6:
+        return [(0.0, 360.0)]
+    return apart
+
+
+def _draw_fates(svg: Svg, angles: AngleAxis, seam: Sequence[SeamBin], top: float, bottom: float) -> None:
+    """Per bin a column of the shares of its pixels, the walls at the bottom."""
+    columns: dict[str, list[str]] = {}
+    for each in seam:
+        total = sum(each.fate.values())
+        for x, width in angles.spans(each.angle_deg - BIN_DEG / 2, each.angle_deg + BIN_DEG / 2):
+            level = bottom
+            if total == 0:
+                svg.add("rect", x=x, y=float(top), width=width, height=float(bottom - top), fill="url(#unseen)")
+            for name in FATES:
+                height = each.fate.get(name, 0) / max(total, 1) * (bottom - top)
+                if height > 0:
+                    level -= height
+                    columns.setdefault(name, []).append(f"M{x:.1f} {level:.2f}h{width:.2f}v{height:.2f}h{-width:.2f}z")
+    for name in FATES:
+        if name in columns:
+            svg.add("path", d="".join(columns[name]), class_=f"fate-{name}")
+    svg.text(LEFT - 9, top + 9, "100 %", "tick", "end")
+    svg.text(LEFT - 9, bottom, "0", "tick", "end")
+    svg.upright(16, (top + bottom) / 2, "pixels")
+
+
+def _draw_numbers(svg: Svg, angles: AngleAxis, marks: Sequence[Mark], y: float) -> None:
+    """The bars' numbers above their columns; neighbours share a label."""
+    places = sorted((place[1], mark.number) for mark in marks if (place := angles(mark.at_deg)) is not None)
+    groups: list[tuple[list[float], list[int]]] = []
+    for x, number_ in places:
+        if groups and x - groups[-1][0][-1] < 22:
+            groups[-1][0].append(x)
+            groups[-1][1].append(number_)
+        else:
+            groups.append(([x], [number_]))
+    for xs, numbers in groups:
+        x = (xs[0] + xs[-1]) / 2
+        svg.path([(x - 5, y - 4), (x + 5, y - 4), (x, y + 4)], "bar-mark", close=True)
+        svg.text(x, y - 7, ", ".join(map(str, sorted(set(numbers)))), "bar-number")
 
 
 def map_chart(pictures: Sequence[str], extent: Extent, scale_mm: float) -> str:
@@ -278,8 +437,14 @@ def histogram_chart(histogram: Histogram) -> str:
     return str(svg)
 
 
-def clock(step: StepResult) -> str:
-    """The seam as a clock face seen along the axis: which arcs were seen, and where the step is largest."""
+def clock(
+    step: StepResult | None,
+    seen_deg: float,
+    seam: Sequence[SeamBin] = (),
+    coverage: Coverage | None = None,
+    marks: Sequence[Mark] = (),
+) -> str:
+    """The seam as a clock face seen along the axis: what was seen, what is missing, what bars, where it is largest."""
     svg = Svg(230, 230, "Which arcs of the seam were seen")
 
     def at(angle_deg: float, radius: float) -> tuple[float, float]:
@@ -287,23 +452,34 @@ def clock(step: StepResult) -> str:
         turn = math.radians(angle_deg - 90)
         return 115 + radius * math.cos(turn), 115 + radius * math.sin(turn)
 
-    svg.add("circle", cx=115, cy=115, r=70, class_="ring")
-    for start, end in arcs_of(step.angle_deg.tolist()):
+    def arc(start: float, end: float, class_: str) -> None:
         if end - start >= 360:
-            svg.add("circle", cx=115, cy=115, r=70, class_="ring-seen")
-            continue
+            svg.add("circle", cx=115, cy=115, r=70, class_=class_)
+            return
         (x0, y0), (x1, y1) = at(start, 70), at(end, 70)
-        svg.add(
-            "path", d=f"M{x0:.1f} {y0:.1f}A70 70 0 {int(end - start > 180)} 1 {x1:.1f} {y1:.1f}", class_="ring-seen"
-        )
+        large = int((end - start) % 360 > 180)
+        svg.add("path", d=f"M{x0:.1f} {y0:.1f}A70 70 0 {large} 1 {x1:.1f} {y1:.1f}", class_=class_)
+
+    svg.add("circle", cx=115, cy=115, r=70, class_="ring")
+    measured = [] if step is None else step.angle_deg[step.measured].tolist()
+    for start, end in arcs_of(measured, bridge_deg=BIN_DEG):
+        arc(start, end, "ring-seen")
+    for start, end in unseen_arcs(seam, coverage):
+        arc(start, end, "ring-gap")
     for angle in range(0, 360, 30):
         (x0, y0), (x1, y1) = at(angle, 78), at(angle, 83)
         svg.line(x0, y0, x1, y1, "zero")
     for angle in range(0, 360, 90):
         x, y = at(angle, 98)
         svg.text(x, y + 4, f"{angle}°", "tick")
-    x, y = at(step.max_abs_at_deg, 70)
-    svg.add("circle", cx=x, cy=y, r=6.0, class_="mark")
-    svg.text(115, 112, f"{step.coverage_deg:.0f}°", "clock")
+    for mark in marks:
+        (x0, y0), (x1, y1) = at(mark.at_deg, 58), at(mark.at_deg, 82)
+        svg.line(x0, y0, x1, y1, "ring-bar")
+    if step is not None and measured:
+        x, y = at(step.max_abs_at_deg, 70)
+        svg.add("circle", cx=x, cy=y, r=6.0, class_="mark")
+    svg.text(115, 112, f"{math.floor(seen_deg + 1e-6)}°", "clock")
     svg.text(115, 130, "of 360° seen", "tick")
+    if coverage is not None and not coverage.enough:
+        svg.text(115, 147, f"{coverage.required_deg:.0f}° required", "short")
     return str(svg)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from weldscan import terminal
 from weldscan.devices import BACKENDS, backend
 from weldscan.errors import DeviceError, InputError
 from weldscan.pose import KukaPose
@@ -286,15 +287,14 @@ def scan(
         with _progress() as tell:
             result = run(read_cell(config), out, resume, tell, _ask_the_operator)
     except KeyboardInterrupt:
-        print(f"weldscan: stopped; what was kept is whole. To go on: {how}", file=sys.stderr)
+        terminal.complain(f"weldscan: stopped; what was kept is whole. To go on: {how}")
         raise typer.Exit(INTERRUPTED) from None
-    print(f"{result.whole} of {result.planned} shots in {out}")
-    for name, reason in result.rejected:
-        print(f"       rejected {name}: {reason}")
-    if result.whole < result.planned:
-        print(f"       to go on: {how}")
-        raise typer.Exit(NOT_MEASURED)
-    print(f"       next: weldscan inspect {out}")
+    complete = result.whole >= result.planned
+    with terminal.answer(0 if complete else NOT_MEASURED):
+        print(f"{result.whole} of {result.planned} shots in {out}")
+        for name, reason in result.rejected:
+            print(f"       rejected {name}: {reason}")
+        print(f"       next: weldscan inspect {out}" if complete else f"       to go on: {how}")
 
 
 def _ask_the_operator(shot: ShotSpec) -> None:

@@ -391,11 +391,12 @@ def standing_of(
     now = datetime.now(UTC) if now is None else now
     path = _where(session, history)
     if path is None:
-        return Standing(True, "no verification on record", accepted=accept)
+        return Standing("none", "no verification on record", accepted=accept)
     found = read_history(path)
     records = found.of(scanner_id(session.scanner))
     last = records[-1] if records else None
     why = found.broken
+    state: Literal["verified", "failed", "expired"] = "failed"
     if why is not None:
         why = f"the history cannot be relied upon: {why}"
     elif last is None:
@@ -407,7 +408,9 @@ def standing_of(
     elif last.verdict is not Verdict.PASS:
         why = f"the last verification, of {last.date}, ended in {last.verdict}"
     elif moment(last.valid_until, "valid_until") < now:
-        why = f"the verification of {last.date} expired on {last.valid_until}"
+        state, why = "expired", f"the verification of {last.date} expired on {last.valid_until}"
+    else:
+        state = "verified"
     notes = list(found.notes)
     if last is not None and last.fringes != fringes_of(session):
         notes.append(
@@ -418,7 +421,7 @@ def standing_of(
         judged = ", ".join(name for name, each in last.characteristics.items() if each.verdict is Verdict.PASS)
         text = f"verified on {last.date} ({judged}), valid until {last.valid_until}"
     return Standing(
-        good=why is None,
+        state=state,
         text=text,
         history=str(path),
         id=last.id if last else None,

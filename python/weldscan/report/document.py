@@ -1,0 +1,386 @@
+"""`result.json`: an inspection as plain data, `weldscan-result/2` (docs/formats.md), and reading it back."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from weldscan._weldcore import __version__
+from weldscan.errors import InputError
+from weldscan.result import (
+    FATES,
+    ArtefactShot,
+    Coverage,
+    Finding,
+    HandEye,
+    Inspection,
+    Judgement,
+    Label,
+    PartCloud,
+    SeamBin,
+    Standing,
+    StepResult,
+    Verdict,
+    along_seam_mm,
+)
+from weldscan.session import plain, read_text
+
+SCHEMA = "weldscan-result/2"
+READABLE = ("weldscan-result/1", SCHEMA)
+CLASSES = {
+    "reference_wall": Label.REFERENCE_WALL,
+    "other_wall": Label.OTHER_WALL,
+    "bead": Label.BEAD,
+}
+NO_VERIFICATION = Standing("none", "no verification on record")
+
+
+def report_id(inspection: Inspection, created: datetime) -> str:
+    """A number that no other report has: the day, and a hash of the session and the moment."""
+    text = f"{inspection.session}|{inspection.software.get('session_sha256', '')}|{created.isoformat()}"
+    return f"{created:%Y%m%d}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def result_document(inspection: Inspection, created: datetime) -> dict[str, Any]:
+    """`weldscan-result/2` as plain data; what has no value is null or absent, never NaN."""
+    step, hand_eye = inspection.step, inspection.hand_eye
+    document = {
+        "schema": SCHEMA,
+        "report": report_id(inspection, created),
+        "created": created.isoformat(timespec="seconds"),
+        "session": inspection.session,
+        "part": inspection.part,
+        "frame": inspection.frame,
+        "method": inspection.method,
+        "verdict": inspection.verdict,
+        "headline": _headline(inspection),
+        "judged_mm": inspection.judged_mm,
+        "step_mm": _step(step),
+        "profile": profile(step, inspection.part),
+        "seam": [_seam_bin(each) for each in inspection.seam],
+        "coverage": _coverage(inspection.coverage, inspection.seen_deg),
+        "uncertainty_budget": [
+            {"name": line.name, "standard_mm": line.standard_mm, "derived_from": line.derived_from}
+            for line in (step.budget if step else ())
+        ],
+        "calibration": inspection.calibration,
+        "scanner": None if inspection.scanner is None else vars(inspection.scanner),
+        "hand_eye": _hand_eye(hand_eye),
+        "agreement": [vars(pair) for pair in inspection.agreement],
+        "counts": counts(inspection.cloud),
+        "verdicts": [_verdict(judgement) for judgement in inspection.verdicts],
+        "judgements": [_judgement(judgement) for judgement in inspection.verdicts],
+        "bars": [_bar(finding) for finding in inspection.bars],
+        "findings": [{"severity": finding.severity, **_bar(finding)} for finding in inspection.findings],
+        "verification": _standing(inspection.verification or NO_VERIFICATION),
+        "left_out": [{"shot": shot, "reason": reason} for shot, reason in inspection.left_out],
+        "warnings": list(inspection.warnings),
+        "masks": inspection.masks,
+        "response": inspection.response,
+        "timing_s": inspection.timing_s,
+        "software": {"version": __version__, **inspection.software},
+    }
+    result: dict[str, Any] = plain(document)
+    return result
+
+
+def headline_text(inspection: Inspection) -> str:
+    """The verdict in one line: how much was seen, by which clause, how sure its limit, why."""
+    judgement = inspection.headline
+    if judgement is None:
+        return f"{inspection.words()}: no norm was asked"
+    return f"{inspection.words()} by {judgement_text(judgement)}"
+
+
+def judgement_text(judgement: Judgement) -> str:
+    """By which clause, how sure its limit is, and why."""
+    clause = f", {judgement.clause}" if judgement.clause else ""
+    doubt = f" [{judgement.doubt}]" if judgement.doubt else ""
+    return f"{judgement.norm}{clause}{doubt}: {judgement.reason}"
+
+
+def _headline(inspection: Inspection) -> dict[str, Any]:
+    judgement = inspection.headline
+    return {
+        "verdict": inspection.verdict,
+        "words": inspection.words(),
+        "norm": judgement.norm if judgement else None,
+        "clause": judgement.clause if judgement else None,
+        "rule": judgement.rule if judgement else None,
+        "margin": judgement.margin if judgement else None,
+        "evidence": judgement.evidence if judgement else None,
+        "text": headline_text(inspection),
+    }
+
+
+def _step(step: StepResult | None) -> dict[str, Any]:
+    if step is None:
+        names = ("mean", "median", "max_abs", "max_abs_at_deg", "expanded_uncertainty", "histogram")
+        return {**dict.fromkeys(names), "coverage_deg": 0.0, "harmonics": {}, "not_observable": []}
+    histogram = step.histogram
+    document = {
+        "mean": step.mean_mm,
+        "median": step.median_mm,
+        "seam_mean": step.seam_mean_mm,
+        "seam_mean_u": step.seam_mean_u_mm,
+        "max_abs": step.max_abs_mm,
+        "max_abs_at_deg": step.max_abs_at_deg,
+        "expanded_uncertainty": step.expanded_uncertainty_mm,
+        "histogram": histogram.step_mm if histogram else None,
+        "histogram_u": histogram.expanded_uncertainty_mm if histogram else None,
+        "coverage_deg": step.coverage_deg,
+        "harmonics": step.harmonics_mm,
+        "not_observable": step.not_observable,
+    }
+    if step.angle_between_walls_deg is not None:
+        document["angle_between_walls_deg"] = step.angle_between_walls_deg
+        document["angle_between_walls_u_deg"] = step.angle_between_walls_u_deg
+    return document
+
+
+def profile(step: StepResult | None, part: Mapping[str, Any]) -> list[dict[str, float]]:
+    """The measured bins: those that hold a number with its uncertainty."""
+    if step is None:
+        return []
+    rows = zip(*(column[step.measured].tolist() for column in (step.angle_deg, step.step_mm, step.u_mm)), strict=True)
+    return [{"angle_deg": angle, **_along(angle, part), "step_mm": value, "u_mm": u} for angle, value, u in rows]
+
+
+def _along(angle_deg: float, part: Mapping[str, Any]) -> dict[str, float]:
+    along = along_seam_mm(angle_deg, part)
+    return {} if along is None else {"along_mm": along}
+
+
+def profile_csv(step: StepResult | None, part: Mapping[str, Any]) -> str:
+    """The profile as rows of text."""
+    text = io.StringIO()
+    text.write("angle_deg,step_mm,u_mm,along_mm\n")
+    for row in profile(step, part):
+        along = f"{row['along_mm']:.3f}" if "along_mm" in row else ""
+        text.write(f"{row['angle_deg']:g},{row['step_mm']:.5f},{row['u_mm']:.5f},{along}\n")
+    return text.getvalue()
+
+
+def _seam_bin(each: SeamBin) -> dict[str, Any]:
+    return {
+        "angle_deg": each.angle_deg,
+        "along_mm": each.along_mm,
+        "measured": each.measured,
+        "fate": {name: each.fate.get(name, 0) for name in FATES},
+        "cap_width_mm": each.cap_width_mm,
+        "toes_mm": each.toes_mm,
+    }
+
+
+def _coverage(coverage: Coverage | None, seen_deg: float) -> dict[str, Any]:
+    if coverage is None:
+        return {"seen_deg": seen_deg, "required_deg": None, "required_by": None, "gaps": []}
+    return {
+        "seen_deg": coverage.seen_deg,
+        "required_deg": coverage.required_deg,
+        "required_by": coverage.required_by,
+        "gaps": coverage.gaps,
+    }
+
+
+def _bar(finding: Finding) -> dict[str, Any]:
+    return {"code": finding.code, "shot": finding.shot, "at_deg": finding.at_deg, "text": finding.text}
+
+
+def _standing(standing: Standing) -> dict[str, Any]:
+    return {**vars(standing), "good": standing.good}
+
+
+def _hand_eye(hand_eye: HandEye | None) -> dict[str, Any] | None:
+    if hand_eye is None:
+        return None
+    return {
+        "id": hand_eye.id,
+        "date": hand_eye.date,
+        "flange_from_scanner": hand_eye.flange_from_scanner,
+        "covariance": hand_eye.covariance,
+        "residual_rms_mm": hand_eye.residual_rms_mm,
+        "reduced_chi2": hand_eye.reduced_chi2,
+        "working_point_u_mm": hand_eye.working_point_u_mm,
+        "pose_sigma_mm": hand_eye.pose_sigma_mm,
+        "pose_sigma_rad": hand_eye.pose_sigma_rad,
+        "sphere_sigma_ratio": hand_eye.sphere_sigma_ratio,
+        "probe_bias_mm": hand_eye.probe_bias_mm,
+        "probe_bias_u_mm": hand_eye.probe_bias_u_mm,
+        "tilts_deg": hand_eye.tilts_deg,
+        "warnings": hand_eye.warnings,
+        "touched_distances_mm": hand_eye.touched_distances_mm,
+        "per_shot": [artefact_shot(shot) for shot in hand_eye.per_shot],
+    }
+
+
+def artefact_shot(shot: ArtefactShot) -> dict[str, Any]:
+    """One row of `hand_eye.per_shot`."""
+    return {
+        "shot": shot.shot,
+        "residual_rms_mm": shot.residual_rms_mm,
+        "left_out_error_mm": shot.left_out_error_mm,
+        "chi2": shot.chi2,
+        "outlier": shot.outlier,
+        "distances_mm": shot.distances_mm,
+        "spheres": [
+            {
+                "centre_mm": sphere.centre_mm,
+                "covariance_mm2": sphere.covariance_mm2,
+                "rms_mm": sphere.rms_mm,
+                "points": sphere.points,
+                "residual_mm": sphere.residual_mm,
+            }
+            for sphere in shot.spheres
+        ],
+    }
+
+
+def _verdict(judgement: Judgement) -> dict[str, Any]:
+    return {
+        "norm": judgement.norm,
+        "clause": judgement.clause,
+        "limit_mm": judgement.limit_mm,
+        "value_mm": judgement.value_mm,
+        "expanded_uncertainty_mm": judgement.expanded_uncertainty_mm,
+        "verdict": judgement.verdict,
+        "reason": judgement.reason,
+        "details": judgement.details,
+    }
+
+
+def _judgement(judgement: Judgement) -> dict[str, Any]:
+    lower, upper = judgement.interval_mm or (None, None)
+    return {
+        "norm": judgement.norm,
+        "clause": judgement.clause,
+        "rule": judgement.rule,
+        "quantity": judgement.quantity,
+        "limit": judgement.limit_mm,
+        "value": judgement.value_mm,
+        "u": judgement.expanded_uncertainty_mm,
+        "upper": upper,
+        "lower": lower,
+        "margin": judgement.margin,
+        "verdict": judgement.verdict,
+        "reason": judgement.reason,
+        "evidence": judgement.evidence,
+        "probability_over_limit": judgement.probability_over_limit,
+        "barred_by": sorted({finding.code for finding in judgement.barred_by}),
+    }
+
+
+def counts(cloud: PartCloud | None) -> dict[str, int]:
+    """How many points there are, in all and per class."""
+    label = np.zeros(0, np.uint8) if cloud is None else cloud.label
+    per_label = np.bincount(label, minlength=len(Label))
+    return {"points": int(label.size)} | {name: int(per_label[value]) for name, value in CLASSES.items()}
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read_result(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """A result that was written before, as the fields of `weldscan-result/2` have it.
+
+    A file of `weldscan-result/1` is read too: `schema` stays what it was, its own fields are untouched, and those of /2
+    are added as far as they follow from it. What was not looked for then (bars, fates) is empty, not found to be good.
+
+    Args:
+        path: a result's folder, or its `result.json`.
+
+    Returns:
+        The document; lengths in mm, as `docs/formats.md` describes it.
+
+    Raises:
+        InputError: there is no such file, it is not JSON, or not a result that this version knows.
+
+    Example:
+        >>> import tempfile
+        >>> from weldscan import inspect, read_result, write_report
+        >>> from weldscan.devices.simulated import simulate_session
+        >>> folder = tempfile.mkdtemp()
+        >>> truth = simulate_session(folder + "/session")
+        >>> out = write_report(inspect(folder + "/session"), folder + "/report")
+        >>> read_result(out)["verdict"]
+        'PASS'
+    """
+    path = Path(path)
+    file = path / "result.json" if path.is_dir() else path
+    try:
+        document = json.loads(read_text(file))
+    except RecursionError:
+        raise InputError(f"{file}: is nested too deeply") from None
+    except ValueError as error:
+        raise InputError(f"{file}: is not JSON: {error}") from None
+    schema = document.get("schema") if isinstance(document, dict) else None
+    if schema not in READABLE:
+        raise InputError(f"{file}: schema: must be one of {', '.join(READABLE)}, got {schema!r}")
+    try:
+        return _of_version_1(document) if schema == READABLE[0] else document
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{file}: is no whole result: {type(error).__name__}: {error}") from None
+
+
+def _of_version_1(document: dict[str, Any]) -> dict[str, Any]:
+    """What of /2 follows from /1."""
+    verdicts = tuple(
+        Judgement(**{**found, "verdict": Verdict(found["verdict"])})  # its fields have kept their names
+        for found in document["verdicts"]
+    )
+    step = document["step_mm"]
+    held = document.get("verification") or {}
+    standing = {**vars(NO_VERIFICATION), **held, "state": _state_of_version_1(held)}
+    inspection = Inspection(
+        session=document["session"],
+        part=document["part"],
+        method=document["method"],
+        frame=document["frame"],
+        step=None,
+        hand_eye=None,
+        cloud=None,
+        verdicts=verdicts,
+        left_out=(),
+        findings=(),
+        masks={},
+        timing_s={},
+        software={},
+        coverage=Coverage(step["coverage_deg"], 0.0, "", ()),
+    )
+    return document | {
+        "headline": plain(_headline(inspection)),
+        "profile": [
+            row | _along(row["angle_deg"], document["part"]) for row in document["profile"] if None not in row.values()
+        ],
+        "seam": [],
+        "coverage": _coverage(None, step["coverage_deg"]),
+        "calibration": "not stated",
+        "judgements": plain([_judgement(judgement) for judgement in verdicts]),
+        "bars": [],
+        "findings": [
+            {"severity": "warning", "code": None, "shot": None, "at_deg": None, "text": text}
+            for text in document["warnings"]
+        ],
+        "step_mm": step | {"not_observable": []},
+        "verification": standing | {"good": standing["state"] == "verified"},
+    }
+
+
+def _state_of_version_1(held: Mapping[str, Any]) -> str:
+    """What became `verification.state`: /1 had `good`, true without any verification too, and words."""
+    if not held or held.get("history") is None:
+        return "none"
+    if held["good"]:
+        return "verified"
+    return "expired" if " expired on " in held["text"] else "failed"

@@ -1,0 +1,59 @@
+"""What a scan determines of two pipes: each term with its U, or named as not observable."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from weldscan.observable import ANGLE_PRIOR_DEG, DIAMETER_PRIOR, OFFSET_PRIOR, seam_terms
+
+STEP = {
+    "radius_difference_mm": (0.2, 0.01),
+    "axis_offset_mm": [-0.3, 0.4],
+    "axis_offset_standard_mm": 0.05,
+    "tilt_rad": math.radians(0.1),
+    "tilt_standard_rad": math.radians(0.02),
+}
+
+
+def test_what_is_determined_has_its_uncertainty():
+    found = seam_terms(STEP, 630.0, 6.0)
+    assert found.not_observable == ()
+    assert found.harmonics_mm == pytest.approx(
+        {
+            "diameter_difference": 0.4,
+            "diameter_difference_u": 0.04,
+            "axis_offset": 0.5,
+            "axis_offset_u": 0.1,
+            "axis_offset_at_deg": math.degrees(math.atan2(0.4, -0.3)),
+        }
+    )
+    assert (found.angle_deg, found.angle_u_deg) == pytest.approx((0.1, 0.04))
+
+
+def test_what_once_stood_under_a_green_pass_is_not_observable():
+    # -58.8 +- 136.8 mm of diameter and 29.7 mm of offset, of a short arc.
+    found = seam_terms(
+        {"radius_difference_mm": (-29.4, 34.2), "axis_offset_mm": [29.7, 0.0], "tilt_rad": 0.0}, 630.0, 6.0
+    )
+    assert found.harmonics_mm == {} and found.angle_deg is found.angle_u_deg is None
+    assert found.not_observable == ("diameter_difference", "axis_offset", "angle_between_walls")
+
+
+@pytest.mark.parametrize(
+    ("field", "name", "at_most"),
+    [
+        # Standard uncertainties at which U is half the prior.
+        ("radius_difference_mm", "diameter_difference", DIAMETER_PRIOR * 630.0 / 8),
+        ("axis_offset_standard_mm", "axis_offset", OFFSET_PRIOR * 6.0 / 4),
+        ("tilt_standard_rad", "angle_between_walls", math.radians(ANGLE_PRIOR_DEG) / 4),
+    ],
+)
+def test_half_of_what_pipes_differ_by_is_the_bound(field, name, at_most):
+    def missing(standard: float | None) -> tuple[str, ...]:
+        value = (0.2, standard) if field == "radius_difference_mm" else standard
+        return seam_terms({**STEP, field: value}, 630.0, 6.0).not_observable
+
+    assert missing(0.0) == missing(0.999 * at_most) == ()
+    assert missing(1.001 * at_most) == missing(math.inf) == missing(math.nan) == (name,)

@@ -9,7 +9,7 @@ import math
 import os
 import platform
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, date, datetime
 from typing import Any, Literal, cast
@@ -46,15 +46,18 @@ from weldscan.result import (
     ShotAgreement,
     Standing,
     StepResult,
+    bar,
     note,
     warning,
 )
-from weldscan.session import PartSpec, ShotSpec, read_session
+from weldscan.seam import BIN_DEG, EdgeProfile, Seam, edge_profile, seam_of
+from weldscan.session import PartSpec, Session, ShotSpec, read_session
 from weldscan.verification.history import standing_of
 
 Floats = NDArray[np.float64]
 DEFAULT_NORMS = ("pnae-g-7-010-89",)
 METHODS = ("surface", "paper")
+ReaderOf = Callable[[Session, Progress | None, Compensate], PointReader]
 
 
 def inspect(
@@ -67,6 +70,7 @@ def inspect(
     response: str | os.PathLike[str] | Response = "auto",
     required_coverage_deg: float | None = None,
     progress: Progress | None = None,
+    reader: ReaderOf = PointReader,
 ) -> Inspection:
     """The step of a weld with its uncertainty and verdicts, from a session folder.
 
@@ -83,6 +87,8 @@ def inspect(
         required_coverage_deg: how much of the seam must be seen for a PASS, 360 for all of it; by default what the
             session's `part.required_coverage_deg` says.
         progress: called with (done, total, what) while it works.
+        reader: makes what turns a shot into points, from the session, `progress` and what to do about the response: by
+            default from the shot's images.
 
     Returns:
         Inspection. What could not be measured has `step` None and verdicts NOT MEASURED with the reason.
@@ -100,12 +106,13 @@ def inspect(
         >>> abs(result.step.max_abs_mm - abs(truth["step_mm"]["max_abs"])) < result.step.expanded_uncertainty_mm
         True
     """
-    run = _Run(folder, method, norms, response, progress, history, accept_verification, required_coverage_deg)
+    run = _Run(folder, method, norms, response, progress, history, accept_verification, required_coverage_deg, reader)
     # 1-4  the three-sphere plate in every artefact shot: where the scanner sits on the flange
     hand_eye = hand_eye_of(run.read, run.left_out)
     # 5-6  every part shot: its points, its place in base, reference wall, other wall and bead
     welds = [weld for shot in run.part_shots if (weld := run.weld(shot, hand_eye)) is not None]
-    # 7    the step: all shots in one model, each against its own reference wall; and the paper's chain
+    # 7    the step: all shots in one model, each against its own reference wall; the surfaces beside the toes; what became
+    #      of every pixel; and the paper's chain
     step, cloud = run.measure(welds, hand_eye)
     # 8    the verdict
     return run.judged(step, cloud, hand_eye)
@@ -123,7 +130,8 @@ class _Run:
         progress: Progress | None,
         history: str | os.PathLike[str] | None,
         accept_verification: str | None,
-        required_coverage_deg: float | None = None,
+        required_coverage_deg: float | None,
+        reader: ReaderOf,
     ) -> None:
         if method not in METHODS:
             raise InputError(f"method: must be one of {', '.join(METHODS)}, got {method!r}")
@@ -139,7 +147,8 @@ class _Run:
         self.method, self.norms = method, tuple(norms)
         self.standing = standing_of(self.session, history, accept_verification)
         self.response = response
-        self.read = PointReader(self.session, progress, _compensation(response))
+        self.read = reader(self.session, progress, _compensation(response))
+        self.seam: Seam | None = None
         self.agreement: tuple[ShotAgreement, ...] = ()
         faults = faults_of(self.session.folder)
         self.left_out: list[tuple[str, str]] = [(fault.shot, fault.reason) for fault in faults]
@@ -197,7 +206,22 @@ class _Run:
         except GeometryError as error:
             self.left_out.extend((self.session.part_shots[weld.index].name, str(error)) for weld in welds)
             return None, None
+        edges = edge_profile(welds)
+        found = _step_result(step, edges, self.part)
         t = self.read.clock("measure", t)
+        measured = np.rint(found.angle_deg / BIN_DEG).astype(int).tolist()
+        by = "session" if self.required_coverage_deg is None else "option"
+        required = self.required_deg
+        self.seam = seam_of(
+            welds,
+            self.read.scanner,
+            measured,
+            self.part.outside_diameter / 2,
+            required,
+            "views" if required is None else by,
+        )
+        self.read.findings += self.seam.findings
+        t = self.read.clock("seam", t)
         deviations = step["deviation_mm"]
         cloud = PartCloud(
             *place_shots(
@@ -210,7 +234,16 @@ class _Run:
             t = self.read.clock("agreement", t)
         histogram = self.paper(cloud, welds[0])
         self.read.clock("paper", t)
-        return _step_result(step, histogram, self.part), cloud
+        if not found.angle_deg.size:
+            self.left_out.extend((weld.name, "no angle at which both walls and both edges were seen") for weld in welds)
+            return None, cloud
+        return replace(found, histogram=histogram), cloud
+
+    @property
+    def required_deg(self) -> float | None:
+        """The least coverage that option or session ask for."""
+        asked = self.required_coverage_deg
+        return self.part.required_coverage_deg if asked is None else asked
 
     def hold_together(self, cloud: PartCloud, welds: Sequence[PartView], hand_eye: HandEye) -> None:
         """Shots that saw the same wall, held against each other in base."""
@@ -254,7 +287,9 @@ class _Run:
             self.read.findings.append(note("response", compensated["note"]))
         if (said := about_verification(self.standing)) is not None:
             self.read.findings.append(said)
-        required = self.part.required_coverage_deg if self.required_coverage_deg is None else self.required_coverage_deg
+        doubts = {norm: self.edges_above(norm, step) for norm in self.norms}
+        self.read.findings += dict.fromkeys(said for said in doubts.values() if said is not None)
+        common = [finding for finding in self.read.findings if finding not in doubts.values()]
         verdicts = [
             verdict
             for norm in self.norms
@@ -265,8 +300,8 @@ class _Run:
                 part,
                 why_not_measured=reason,
                 coverage_deg=coverage,
-                required_coverage_deg=required,
-                bars=self.read.findings,
+                required_coverage_deg=self.required_deg,
+                bars=[*common, *([doubt] if (doubt := doubts[norm]) else [])],
             )
         ]
         timing = self.read.timing
@@ -295,7 +330,23 @@ class _Run:
             verification=self.standing,
             agreement=self.agreement,
             scanner=scanner,
+            seam=self.seam.bins if self.seam else (),
+            coverage=self.seam.coverage if self.seam else None,
         )
+
+    def edges_above(self, norm: str, step: StepResult | None) -> Finding | None:
+        """A bar where the walls keep a norm's limit and the surfaces beside the toes may not."""
+        if step is None or step.edge_upper_mm is None or step.judged == "edge" or self.method == "paper":
+            return None
+        part = self.part.model_dump()
+        limits = [each.limit_mm for each in judge(norm, 0.0, 0.0, part) if each.limit_mm is not None]
+        if not limits or step.edge_upper_mm <= min(limits):
+            return None
+        text = (
+            f"the surfaces right beside the weld stand up to {step.edge_upper_mm:.3f} mm apart, as far as they can be "
+            f"read, where the limit is {min(limits):.3f} mm; the undisturbed walls, extrapolated, keep it"
+        )
+        return bar("edges", text)
 
     def scanner_record(self) -> ScannerRecord | None:
         """Which calibration of the scanner this is, where the session says; with a warning where it is out of date."""
@@ -403,27 +454,55 @@ BUDGET = (
 )
 
 
-def _step_result(step: dict[str, Any], histogram: Histogram | None, part: PartSpec) -> StepResult:
-    profile = step["profile"]
+def _step_result(step: dict[str, Any], edges: EdgeProfile, part: PartSpec) -> StepResult:
+    """The profile of the bins in which both walls and both edges were read; judged by the larger upper bound."""
     columns = step["profile_columns"]
-    worst = profile[int(np.argmax(np.abs(profile[:, columns.index("step_mm")])))]
+    table = step["profile"]
+
+    def column(name: str) -> Floats:
+        return np.asarray(table[:, columns.index(name)])
+
+    bins = np.rint(column("angle_deg") / BIN_DEG).astype(int) % len(edges.step_mm)
+    read = np.isfinite(edges.step_mm[bins])
+    table, bins = table[read], bins[read]
+    wall, wall_u = column("step_mm"), 2 * column("standard_mm")
+    edge, edge_u = edges.step_mm[bins], edges.u_mm[bins]
+    budget: tuple[BudgetLine, ...] = ()
+    value, u, at = math.nan, math.nan, math.nan
+    judged: Literal["wall", "edge"] = "wall"
+    if len(table):
+        worst = int(np.argmax(np.abs(wall)))
+        value, u, at = abs(float(wall[worst])), float(wall_u[worst]), float(column("angle_deg")[worst])
+        budget = tuple(BudgetLine(name, float(column(key)[worst]), derived) for key, name, derived in BUDGET)
+        # The walls' own largest upper bound may stand in another bin than their largest step.
+        upper = max(value + u, float((np.abs(wall) + wall_u).max()))
+        if edges.judged is not None and edges.worst is not None and sum(edges.judged) > upper and (
+            edges.contradict(bins, wall, wall_u)
+        ):
+            (value, u), at, judged = edges.judged, BIN_DEG * edges.worst, "edge"
+            derived = "reading beside both toes: noise, choice of the stretch, and what the choice of the toes may hide"
+            budget = (BudgetLine("edges", u / 2, derived),)
     terms = seam_terms(step, part.outside_diameter, part.wall_thickness)
     return StepResult(
         mean_mm=step["mean_mm"],
         median_mm=step["median_mm"],
-        max_abs_mm=step["max_abs_mm"],
-        max_abs_at_deg=step["max_abs_at_deg"],
-        expanded_uncertainty_mm=step["expanded_mm"],
-        histogram=histogram,
-        angle_deg=profile[:, columns.index("angle_deg")],
-        step_mm=profile[:, columns.index("step_mm")],
-        u_mm=2 * profile[:, columns.index("standard_mm")],
-        budget=tuple(
-            BudgetLine(name, float(worst[columns.index(column)]), derived) for column, name, derived in BUDGET
-        ),
+        max_abs_mm=value,
+        max_abs_at_deg=at,
+        expanded_uncertainty_mm=u,
+        histogram=None,
+        angle_deg=column("angle_deg"),
+        step_mm=edge if judged == "edge" else wall,
+        u_mm=edge_u if judged == "edge" else wall_u,
+        budget=budget,
         harmonics_mm=terms.harmonics_mm,
         angle_between_walls_deg=terms.angle_deg,
         angle_between_walls_u_deg=terms.angle_u_deg,
         not_observable=terms.not_observable,
-        coverage_deg=step["coverage_deg"],
+        coverage_deg=BIN_DEG * len(table),
+        judged=judged,
+        edge_upper_mm=None if edges.judged is None else sum(edges.judged),
+        wall_step_mm=wall,
+        wall_u_mm=wall_u,
+        edge_step_mm=edge,
+        edge_u_mm=edge_u,
     )

@@ -279,6 +279,17 @@ class StepResult:
     """Expanded, k = 2."""
     not_observable: tuple[str, ...] = ()
     """Names of what this scan does not determine: less than a pipe's tolerances do."""
+    judged: Literal["wall", "edge"] = "wall"
+    """Which of the two steps `step_mm` is, and the verdict is about: the walls', unless the edges contradict them and have
+    the larger upper bound. Where both tell the same, the walls tell it better."""
+    edge_upper_mm: float | None = None
+    """Upper bound of the largest edge step, whichever is judged."""
+    wall_step_mm: Floats | None = None
+    """The undisturbed walls, extrapolated to the weld's centreline."""
+    wall_u_mm: Floats | None = None
+    edge_step_mm: Floats | None = None
+    """The surfaces right beside both toes, as a gauge reads them."""
+    edge_u_mm: Floats | None = None
 
     @property
     def measured(self) -> NDArray[np.bool_]:

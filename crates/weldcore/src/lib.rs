@@ -26,6 +26,8 @@
 //! | [`distance`] | signed distance to clouds, meshes and analytic surfaces |
 //! | [`mesh`] | triangle meshes |
 //! | [`segment`] | reference wall, other wall and bead |
+//! | [`seam_fates`] | what became of every pixel, bin by bin along the seam |
+//! | [`sections`] | cap, toes, the surfaces beside them and the undisturbed walls, station by station |
 //! | [`place`] | the shots of a part joined into one cloud in base |
 //! | [`step`] | the step around the seam and its uncertainty |
 //! | [`memory`] | large results without the cost of fresh memory |
@@ -44,6 +46,8 @@ pub mod normals;
 pub mod phase;
 pub mod place;
 pub mod scanner;
+pub mod seam_fates;
+pub mod sections;
 pub mod segment;
 pub mod simulate;
 mod statistics;

@@ -1,16 +1,8 @@
 //! A scanned part into reference wall, other wall and bead, without seeds.
 //!
-//! The shot is unrolled about the pipe: angle, axial coordinate, radial deviation. The unrolled view is cut into sectors,
-//! each sector's axial profile (medians of narrow axial bins) is explained by two straight walls and what lies between
-//! them. Where each wall ends minimises, for the wall from the edge of the view to a place `t`,
-//!
-//! `SSE of its straight line over [edge, t]  +  λ · (bins beyond t)`,
-//!
-//! that is: a bin belongs to the wall as long as it departs from the wall's line by less than √λ, which is the larger of one
-//! point's noise and three times the unevenness of the walls themselves, both estimated from the profile. The line's tilt
-//! and height are free in each sector, so that neither an inexact pipe model nor a tilted wall matters. A weld's toe
-//! fades in: between the wall and the first bin that shows it lies a strip which looks like wall and is not. Its width
-//! follows from the flank: a parabola that crosses √λ at a distance x from its foot crosses 4 √λ at 2 x.
+//! The shot is unrolled about the pipe: angle, axial coordinate, radial deviation. [`crate::sections`] finds cap, toes and
+//! undisturbed walls in it, station by station; every point gets a fate by them. The reference wall's cylinder is then
+//! fitted to its undisturbed points, with the weld's shrinkage taken out, and all is counted from it.
 
 use nalgebra::Matrix3;
 use rayon::prelude::*;
@@ -18,6 +10,7 @@ use rayon::prelude::*;
 use crate::Vec3;
 use crate::error::{Error, Result, require_positive};
 use crate::fit::{Noise, cylinder};
+use crate::sections::{self, Sections, Station, TOLERANCE_MM, shell_term};
 use crate::statistics::median;
 use crate::threads;
 
@@ -63,6 +56,13 @@ impl PipeFrame {
             .ok_or_else(|| Error::Degenerate { what, reason: "the zero mark lies along the axis".into() })?;
         require_positive("pipe radius", radius_mm)?;
         Ok(Self { origin_mm, axis, zero, radius_mm })
+    }
+
+    /// The point of the cylinder at an angle and an axial coordinate.
+    pub fn point(&self, angle_rad: f64, axial_mm: f64) -> Vec3 {
+        let (sin, cos) = angle_rad.sin_cos();
+        let out = self.zero * cos + self.axis.cross(&self.zero) * sin;
+        self.origin_mm + self.axis * axial_mm + out * self.radius_mm
     }
 
     /// Angle (rad, in [-π, π]), axial coordinate and radial deviation (mm) of a point.
@@ -143,21 +143,39 @@ pub struct Segmentation {
     pub bead_width_mm: f64,
     /// Whether the radius was fitted; otherwise the arc was too short for it and it is the nominal one.
     pub radius_fitted: bool,
+    /// A [`Fate`] per point.
+    pub fates: Vec<u8>,
+    /// Of the nominal wall.
+    pub thickness_mm: f64,
+    /// The cross-sections along the seam.
+    pub sections: Sections,
+}
+
+/// What became of a point.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Fate {
+    /// There is none.
+    None = 0,
+    /// It lies on an undisturbed wall.
+    Wall = 1,
+    /// Between a toe and the undisturbed wall, off the latter.
+    Transition = 2,
+    /// Between the toes.
+    Cap = 3,
+    /// Further from the wall than two thicknesses.
+    Gated = 4,
+    /// Beside an undisturbed wall, off its line.
+    OffLine = 5,
+    /// Where no wall was recognised.
+    Other = 6,
 }
 
 /// Points further from the pipe than this many wall thicknesses are something else: neither a step nor the
 /// reinforcement of a weld comes near.
 const GATE_THICKNESSES: f64 = 2.0;
-/// Points per sector that let each axial bin have a sharp median.
-const POINTS_PER_SECTOR: usize = 10_000;
-/// At most this many sectors: the seam's run is smooth.
-const MAX_SECTORS: usize = 32;
-/// Axial bins are this many point spacings wide.
-const BIN_SPACINGS: f64 = 4.0;
-/// A wall point lies within this many sigma of its wall (5 sigma: one in two million by chance).
-const WALL_SIGMAS: f64 = 5.0;
-/// Medians of bins with fewer points are not used.
-const MIN_POINTS_PER_BIN: usize = 8;
+/// Points so many stations beyond the outermost ones, in the corners of a view, are held against those.
+const CORNER_STATIONS: f64 = 4.0;
 /// How far the real diameter of a pipe may be from its nominal one, relative (the usual delivery tolerance is 1 %). A
 /// radius that the arc does not determine better than this is taken as nominal.
 const DIAMETER_TOLERANCE: f64 = 0.01;
@@ -165,12 +183,8 @@ const DIAMETER_TOLERANCE: f64 = 0.01;
 const OTHER_PIPE: f64 = 0.2;
 /// Normals that the coarse frame is found from.
 const COARSE_POINTS: f64 = 20_000.0;
-/// Of every so many points one tells how far the view reaches.
-const RANGE_STRIDE: usize = 16;
 /// Points that the cylinder of the reference wall is fitted to.
 const FIT_POINTS: usize = 40_000;
-
-const WELD: &str = "weld";
 
 /// Segments one shot. `points` is a pixel grid `width` wide, row-major, NaN where there is no point.
 ///
@@ -185,19 +199,24 @@ pub fn segment(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<S
         return Err(Error::Shape { what: "points", expected, got });
     }
     let coarse = coarse_frame(points, width, nominal)?;
-    let coarse_view = View::of(points, &coarse, nominal)?;
-    let walls = find_walls(&coarse_view)?;
-    let labels = walls.labels(&coarse_view);
-    let (frame, radius_fitted) = reference_frame(points, &labels, &coarse, nominal)?;
-    let centreline = walls.centreline(&coarse_view, &coarse, &frame);
-    let frame = PipeFrame { origin_mm: frame.origin_mm + frame.axis * centreline, ..frame };
+    let unrolled = Unrolled::of(points, &coarse);
+    let thickness = nominal.wall_thickness_mm;
+    let mut sections = sections::examine(&unrolled, &coarse, thickness, GATE_THICKNESSES * thickness)?;
+    let (fates, labels) = sort_points(&sections, &unrolled, thickness);
+    let wall = undrawn(points, &labels, &unrolled, &sections, &coarse, thickness);
+    let (frame, radius_fitted) = reference_frame(&wall, &coarse, nominal)?;
+    let frame = PipeFrame { origin_mm: frame.origin_mm + frame.axis * centreline(&sections, &coarse, &frame), ..frame };
+    reframe(&mut sections, &coarse, &frame);
     Ok(Segmentation {
         frame,
         labels,
+        fates,
         unrolled: Unrolled::of(points, &frame),
-        noise_mm: walls.noise_mm,
-        bead_width_mm: walls.bead_width_mm,
+        noise_mm: sections.noise_mm,
+        bead_width_mm: sections.cap_width_mm,
         radius_fitted,
+        thickness_mm: thickness,
+        sections,
     })
 }
 
@@ -339,374 +358,152 @@ fn tukey(u: f64) -> f64 {
     if u.abs() < 1.0 { (1.0 - u * u).powi(2) } else { 0.0 }
 }
 
-/// The unrolled shot cut into sectors and axial bins.
-struct View {
-    unrolled: Unrolled,
-    /// Index of the sector of each point, or `usize::MAX`.
-    middle_rad: f64,
-    start_rad: f64,
-    sector_rad: f64,
-    sectors: usize,
-    start_mm: f64,
-    bin_mm: f64,
-    bins: usize,
-    gate_mm: f64,
-    /// Median deviation of each bin, NaN with too few points, sector by sector.
-    medians: Vec<f64>,
-    /// Noise of one point (median over the bins of 1.4826 MAD).
-    noise_mm: f64,
-}
-
-impl View {
-    fn of(points: &[[f64; 3]], frame: &PipeFrame, nominal: &Nominal) -> Result<Self> {
-        let unrolled = Unrolled::of(points, frame);
-        let gate_mm = GATE_THICKNESSES * nominal.wall_thickness_mm;
-        // The camera sees less than half a turn: angles from the middle of the view do not wrap.
-        let near = |d: &f32| f64::from(d.abs()) < gate_mm;
-        let unrolled_count = unrolled.angle_rad.len();
-        let count = unrolled.deviation_mm.iter().filter(|d| near(d)).count();
-        let (mut c, mut s) = (0.0, 0.0);
-        for i in (0..unrolled_count).step_by(RANGE_STRIDE).filter(|&i| near(&unrolled.deviation_mm[i])) {
-            let (sin, cos) = unrolled.angle_rad[i].sin_cos();
-            (c, s) = (c + f64::from(cos), s + f64::from(sin));
-        }
-        crate::error::require_count("part points near the nominal pipe", 1000, count)?;
-        let middle_rad = s.atan2(c);
-        let mut view = Self {
-            unrolled,
-            middle_rad,
-            start_rad: 0.0,
-            sector_rad: 1.0,
-            sectors: (count / POINTS_PER_SECTOR).clamp(1, MAX_SECTORS),
-            start_mm: 0.0,
-            bin_mm: 1.0,
-            bins: 1,
-            gate_mm,
-            medians: Vec::new(),
-            noise_mm: 0.0,
-        };
-        let (a, z): (Vec<f64>, Vec<f64>) =
-            (0..unrolled_count).step_by(RANGE_STRIDE).filter_map(|i| view.place(i)).map(|(a, z, _)| (a, z)).unzip();
-        let (a, z) = (inner_range(a), inner_range(z));
-        let spacing = ((a.1 - a.0) * frame.radius_mm * (z.1 - z.0) / count as f64).sqrt();
-        if !(spacing.is_finite() && spacing > 0.0) {
-            return Err(Error::Degenerate { what: "part", reason: "its points span no surface".into() });
-        }
-        view.start_rad = a.0;
-        view.sector_rad = (a.1 - a.0) / view.sectors as f64;
-        view.start_mm = z.0;
-        view.bins = (((z.1 - z.0) / (BIN_SPACINGS * spacing)) as usize).clamp(8, 4096);
-        view.bin_mm = (z.1 - z.0) / view.bins as f64;
-        view.take_medians();
-        Ok(view)
-    }
-
-    /// A point near the pipe: angle from the middle of the view, axial coordinate, deviation.
-    #[inline]
-    fn place(&self, i: usize) -> Option<(f64, f64, f64)> {
-        let d = f64::from(self.unrolled.deviation_mm[i]);
-        (d.abs() < self.gate_mm).then(|| {
-            let turn = f64::from(self.unrolled.angle_rad[i]) - self.middle_rad;
-            let turn = turn - (turn / std::f64::consts::TAU).round() * std::f64::consts::TAU;
-            (turn, f64::from(self.unrolled.axial_mm[i]), d)
+/// What became of every point, from the sections: its [`Fate`] and its [`Label`].
+fn sort_points(sections: &Sections, unrolled: &Unrolled, thickness_mm: f64) -> (Vec<u8>, Vec<u8>) {
+    let grid = &sections.grid;
+    let own: Vec<Option<Bed>> = (0..sections.stations.len()).map(|k| Bed::of(sections, k)).collect();
+    // What little a station without a weld of its own holds is held against its neighbour's.
+    let beds: Vec<Option<(usize, Bed)>> = (0..own.len())
+        .map(|k| {
+            let near = [k, k.wrapping_sub(1), k + 1, k.wrapping_sub(2), k + 2];
+            near.into_iter().find_map(|j| Some((j, (*own.get(j)?)?)))
         })
-    }
-
-    #[inline]
-    fn sector(&self, angle: f64) -> Option<usize> {
-        let k = (angle - self.start_rad) / self.sector_rad;
-        // The outermost points belong to the outermost sectors.
-        (k > -1.0 && k < self.sectors as f64 + 1.0).then(|| (k.max(0.0) as usize).min(self.sectors - 1))
-    }
-
-    #[inline]
-    fn bin(&self, axial: f64) -> Option<usize> {
-        let k = (axial - self.start_mm) / self.bin_mm;
-        (k >= 0.0 && k < self.bins as f64).then_some(k as usize)
-    }
-
-    fn axial_of(&self, bin: f64) -> f64 {
-        self.start_mm + bin * self.bin_mm
-    }
-
-    fn take_medians(&mut self) {
-        let cells = self.sectors * self.bins;
-        let cell_of =
-            |i: usize| self.place(i).and_then(|(a, z, d)| Some((self.sector(a)? * self.bins + self.bin(z)?, d as f32)));
-        let mut starts = vec![0_usize; cells + 1];
-        let n = self.unrolled.angle_rad.len();
-        let found: Vec<Vec<(u32, f32)>> =
-            threads::map_ranges(n, |range| range.filter_map(|i| cell_of(i).map(|(k, d)| (k as u32, d))).collect());
-        for (cell, _) in found.iter().flatten() {
-            starts[*cell as usize + 1] += 1;
+        .collect();
+    let tolerance = TOLERANCE_MM.max(5.0 * sections.noise_mm) + 4.0 * sections.noise_mm;
+    let gate = GATE_THICKNESSES * thickness_mm;
+    let sort = |i: usize| -> (Fate, Label) {
+        let p = grid.place(unrolled, i);
+        if !p.height.is_finite() {
+            return (Fate::None, Label::None);
         }
-        for k in 0..cells {
-            starts[k + 1] += starts[k];
+        // Beyond the pipe's arc there is nothing of the seam.
+        let Some(k) = grid.station_within(p.along, CORNER_STATIONS) else { return (Fate::Other, Label::None) };
+        let Some((k, bed)) = beds[k] else {
+            return (if p.height.abs() > gate { Fate::Gated } else { Fate::Other }, Label::None);
+        };
+        let side = usize::from(p.across > 0.5 * (bed.toes[0] + bed.toes[1]));
+        let out = if side == 0 { bed.toes[0] - p.across } else { p.across - bed.toes[1] };
+        let off = sections.stations[k].wall_at(side, p.across).map_or(p.height, |wall| p.height - wall);
+        if out <= 0.0 {
+            let fate = if off.abs() > gate + bed.height { Fate::Gated } else { Fate::Cap };
+            return (fate, Label::Bead);
         }
-        let mut sorted = vec![0.0_f32; starts[cells]];
-        let mut next = starts.clone();
-        for (cell, d) in found.iter().flatten() {
-            sorted[next[*cell as usize]] = *d;
-            next[*cell as usize] += 1;
+        if off.abs() > gate {
+            return (Fate::Gated, Label::None);
         }
-        let mut slices: Vec<&mut [f32]> = Vec::with_capacity(cells);
-        let mut rest = sorted.as_mut_slice();
-        for k in 0..cells {
-            let (head, tail) = rest.split_at_mut(starts[k + 1] - starts[k]);
-            slices.push(head);
-            rest = tail;
-        }
-        let stats: Vec<(f64, f64)> = threads::install(|| {
-            slices
-                .into_par_iter()
-                .map(|values| {
-                    if values.len() < MIN_POINTS_PER_BIN {
-                        return (f64::NAN, f64::NAN);
-                    }
-                    let middle = values.len() / 2;
-                    let m = *values.select_nth_unstable_by(middle, f32::total_cmp).1;
-                    values.iter_mut().for_each(|v| *v = (*v - m).abs());
-                    let mad = *values.select_nth_unstable_by(middle, f32::total_cmp).1;
-                    (f64::from(m), 1.4826 * f64::from(mad))
-                })
-                .collect()
-        });
-        let mut noises: Vec<f64> = stats.iter().map(|s| s.1).filter(|s| s.is_finite()).collect();
-        self.noise_mm = median(&mut noises);
-        self.medians = stats.into_iter().map(|s| s.0).collect();
-    }
+        let Some(begin) = bed.undisturbed[side] else { return (Fate::Other, Label::None) };
+        let end = bed.ends[side];
+        let fits = off.abs() <= tolerance;
+        let fate = match (out, fits) {
+            (_, true) => Fate::Wall,
+            (out, _) if out > end + grid.bin_mm => Fate::Other,
+            (out, false) if out < begin => Fate::Transition,
+            _ => Fate::OffLine,
+        };
+        // The strip on which the cap's flank throws light of its own (some micrometres) reaches about as far as it is high.
+        let label = match (fate, out < bed.height) {
+            (Fate::Wall, true) => Label::Bead,
+            (Fate::Wall, false) if out >= begin - grid.bin_mm => [Label::ReferenceWall, Label::OtherWall][side],
+            _ => Label::None,
+        };
+        (fate, label)
+    };
+    let parts = threads::map_ranges(unrolled.angle_rad.len(), |range| {
+        range.map(sort).map(|(fate, label)| (fate as u8, label as u8)).unzip::<u8, u8, Vec<u8>, Vec<u8>>()
+    });
+    let (fates, labels): (Vec<Vec<u8>>, Vec<Vec<u8>>) = parts.into_iter().unzip();
+    (fates.concat(), labels.concat())
 }
 
-/// The range of values without its outermost thousandth on either side: stray points do not stretch the view.
-fn inner_range(mut values: Vec<f64>) -> (f64, f64) {
-    let cut = values.len() / 1000;
-    let last = values.len() - 1 - cut;
-    let low = *values.select_nth_unstable_by(cut, f64::total_cmp).1;
-    let high = *values.select_nth_unstable_by(last, f64::total_cmp).1;
-    (low, high)
-}
-
-/// A straight wall of one sector: deviation = height + slope · axial, from the edge of the view to its toe.
+/// What the points of one station are held against.
 #[derive(Debug, Clone, Copy)]
-struct Wall {
-    height_mm: f64,
-    slope: f64,
-    /// First bin that is not wall, counted from the wall's edge of the view.
-    end: usize,
-    /// The same with the strip in which the weld fades in.
-    toe: usize,
-    /// Mean square of the wall's bins about its line.
-    unevenness_mm2: f64,
+struct Bed {
+    toes: [f64; 2],
+    height: f64,
+    /// From where each wall is undisturbed, mm outward of its toe: the median of five stations, so that one that a wave or a
+    /// drop of spatter stopped loses no wall.
+    undisturbed: [Option<f64>; 2],
+    /// How far out it was looked at.
+    ends: [f64; 2],
 }
 
-/// Both walls in each sector (`None` where the sector shows no weld).
-struct Walls {
-    sectors: Vec<Option<(Wall, Wall)>>,
-    noise_mm: f64,
-    bead_width_mm: f64,
-}
-
-/// The wall at the start of a profile, see the module's head; `profile` is (axial, deviation) with NaN for no data.
-fn wall_from_edge(profile: &[(f64, f64)], limit_mm: f64) -> Option<Wall> {
-    // Sums of 1, z, d, zz, zd, dd about the first bin, so that the line over [0, t] costs nothing.
-    let origin = profile.iter().find(|p| p.1.is_finite())?;
-    let lambda = limit_mm * limit_mm;
-    let mut sums = [0.0; 6];
-    let mut best: Option<(f64, Wall)> = None;
-    for (t, &(z, d)) in profile.iter().enumerate() {
-        if d.is_finite() {
-            let (z, d) = (z - origin.0, d - origin.1);
-            for (s, v) in sums.iter_mut().zip([1.0, z, d, z * z, z * d, d * d]) {
-                *s += v;
-            }
-        }
-        let [n, sz, sd, szz, szd, sdd] = sums;
-        let spread = n * szz - sz * sz;
-        if n < 3.0 || spread <= 0.0 {
-            continue;
-        }
-        let slope = (n * szd - sz * sd) / spread;
-        let height = (sd - slope * sz) / n;
-        let sse = (sdd - height * sd - slope * szd).max(0.0);
-        let cost = sse - lambda * n;
-        if best.as_ref().is_none_or(|(c, _)| cost < *c) {
-            let height_mm = origin.1 + height - slope * origin.0;
-            best = Some((cost, Wall { height_mm, slope, end: t + 1, toe: t + 1, unevenness_mm2: sse / n }));
-        }
-    }
-    let (_, mut wall) = best?;
-    let off = |&(z, d): &(f64, f64)| (d - wall.height_mm - wall.slope * z).abs();
-    let beyond = profile.iter().skip(wall.end).position(|p| off(p) > 4.0 * limit_mm);
-    wall.toe = wall.end.saturating_sub(beyond.unwrap_or(1).max(1));
-    Some(wall)
-}
-
-fn find_walls(view: &View) -> Result<Walls> {
-    let profile = |k: usize| -> Vec<(f64, f64)> {
-        let medians = view.medians[k * view.bins..(k + 1) * view.bins].iter();
-        medians.enumerate().map(|(b, &d)| (view.axial_of(b as f64 + 0.5), d)).collect()
-    };
-    let full = |p: &[(f64, f64)]| p.iter().filter(|b| b.1.is_finite()).count() * 2 > view.bins;
-    let mut limit_mm = view.noise_mm;
-    let mut pairs: Vec<Option<(Wall, Wall)>> = Vec::new();
-    // Twice: the walls' own unevenness is known only once there are walls.
-    for _ in 0..2 {
-        pairs = (0..view.sectors)
-            .map(|k| {
-                let forward = profile(k);
-                if !full(&forward) {
-                    return None;
-                }
-                let backward: Vec<_> = forward.iter().rev().copied().collect();
-                Some((wall_from_edge(&forward, limit_mm)?, wall_from_edge(&backward, limit_mm)?))
-            })
-            .collect();
-        // The evener side tells: where only one wall is in view, the other side's line is no wall's.
-        let typical = |pick: fn(&(Wall, Wall)) -> f64| {
-            let mut squares: Vec<f64> = pairs.iter().flatten().map(pick).collect();
-            median(&mut squares)
+impl Bed {
+    fn of(sections: &Sections, k: usize) -> Option<Self> {
+        let stations = &sections.stations;
+        let own = &stations[k];
+        let toes = own.toes_mm?;
+        let near = &stations[k.saturating_sub(2)..(k + 3).min(stations.len())];
+        let outward = |s: &Station, side: usize| {
+            let (toes, from) = (s.toes_mm?, s.undisturbed_mm[side]?);
+            Some(if side == 0 { toes[0] - from } else { from - toes[1] })
         };
-        let evener = typical(|p| p.0.unevenness_mm2).min(typical(|p| p.1.unevenness_mm2));
-        limit_mm = view.noise_mm.max(3.0 * evener.sqrt());
+        let undisturbed = std::array::from_fn(|side| {
+            own.undisturbed_mm[side]?;
+            let mut all: Vec<f64> = near.iter().filter_map(|s| outward(s, side)).collect();
+            Some(median(&mut all))
+        });
+        let ends = std::array::from_fn(|side| {
+            own.walls[side].map_or(0.0, |run| run.to - if side == 0 { -toes[0] } else { toes[1] })
+        });
+        Some(Self { toes, height: own.height_mm.abs(), undisturbed, ends })
     }
-    let seen = pairs.iter().flatten().count();
-    if seen == 0 {
-        return Err(Error::NotFound { what: WELD, reason: "no sector of the view is filled with points".into() });
-    }
-    for pair in &mut pairs {
-        *pair = pair.and_then(|(a, b)| apart(a, b, view.bins));
-    }
-    let welded = pairs.iter().flatten().count();
-    if 2 * welded < seen {
-        let reason = format!(
-            "{} of {seen} sectors are one straight wall within {limit_mm:.3} mm: no weld is in view",
-            seen - welded
-        );
-        return Err(Error::NotFound { what: WELD, reason });
-    }
-    let length = |pick: fn(&(Wall, Wall)) -> usize| {
-        let mut lengths: Vec<f64> = pairs.iter().flatten().map(|p| pick(p) as f64).collect();
-        median(&mut lengths) * view.bin_mm
-    };
-    let (first, second) = (length(|p| p.0.toe), length(|p| p.1.toe));
-    let bead_width_mm = view.bins as f64 * view.bin_mm - first - second;
-    // A wall is extrapolated over half a bead: from less than a whole bead's width that is a guess. A strip narrower than
-    // the wall is thick may be the crown of a bead of which half is in view.
-    for (name, seen_mm) in [("reference wall", first), ("other wall", second)] {
-        if seen_mm < bead_width_mm.max(view.gate_mm / GATE_THICKNESSES) {
-            let reason = format!(
-                "only {seen_mm:.1} mm of the {name} beside a weld {bead_width_mm:.1} mm wide: only one wall is in view"
-            );
-            return Err(Error::NotFound { what: WELD, reason });
+}
+
+/// Where the middle between the toes lies along the axis of `frame`: mean over the stations.
+fn centreline(sections: &Sections, coarse: &PipeFrame, frame: &PipeFrame) -> f64 {
+    let (mut sum, mut count) = (0.0, 0.0);
+    for station in &sections.stations {
+        if let Some([low, high]) = station.toes_mm {
+            sum += frame.unroll(&coarse.point(station.angle_rad, 0.5 * (low + high)).into())[1];
+            count += 1.0;
         }
     }
-    smooth_toes(&mut pairs);
-    keep_clear_of_the_flank(view, &mut pairs);
-    Ok(Walls { sectors: pairs, noise_mm: view.noise_mm, bead_width_mm })
+    sum / f64::max(count, 1.0)
 }
 
-/// Two walls that both claim a strip between them (a weld ground flush shows only its step) lose it; walls that claim most
-/// of each other are one.
-fn apart(mut a: Wall, mut b: Wall, bins: usize) -> Option<(Wall, Wall)> {
-    let contested = (a.end + b.end).saturating_sub(bins);
-    if 2 * contested > a.end.max(b.end) {
-        return None;
+/// The stations in another frame: angles and places along the axis.
+fn reframe(sections: &mut Sections, coarse: &PipeFrame, frame: &PipeFrame) {
+    for station in &mut sections.stations {
+        let angle = station.angle_rad;
+        let across = |x: f64| frame.unroll(&coarse.point(angle, x).into())[1];
+        station.toes_mm = station.toes_mm.map(|toes| toes.map(across));
+        station.undisturbed_mm = station.undisturbed_mm.map(|from| from.map(across));
+        station.angle_rad = frame.unroll(&coarse.point(angle, 0.0).into())[0];
     }
-    a.toe = a.toe.min(a.end.saturating_sub(contested + 1));
-    b.toe = b.toe.min(b.end.saturating_sub(contested + 1));
-    Some((a, b))
-}
-
-/// Each toe becomes the median of its neighbourhood: the seam runs smoothly, and one sector that is misled by spatter, a
-/// hole or a wave of the wall neither lets weld metal pass for wall nor loses a wall.
-fn smooth_toes(pairs: &mut [Option<(Wall, Wall)>]) {
-    let around = |k: usize, pick: fn(&(Wall, Wall)) -> usize| {
-        let window = &pairs[k.saturating_sub(2)..(k + 3).min(pairs.len())];
-        let mut toes: Vec<f64> = window.iter().flatten().map(|p| pick(p) as f64).collect();
-        median(&mut toes) as usize
-    };
-    let limits: Vec<(usize, usize)> =
-        (0..pairs.len()).map(|k| (around(k, |p| p.0.toe), around(k, |p| p.1.toe))).collect();
-    for (pair, (first, second)) in pairs.iter_mut().zip(limits) {
-        if let Some((a, b)) = pair {
-            a.toe = first;
-            b.toe = second;
-        }
+    for doubt in &mut sections.doubts {
+        doubt.angle_rad = frame.unroll(&coarse.point(doubt.angle_rad, 0.0).into())[0];
     }
 }
 
-/// Takes from each wall the strip on which the bead's flank throws light of its own (the fringes are mixed there, by some
-/// micrometres): it reaches about as far as the bead is high.
-fn keep_clear_of_the_flank(view: &View, pairs: &mut [Option<(Wall, Wall)>]) {
-    for (k, pair) in pairs.iter_mut().enumerate() {
-        let Some((a, b)) = pair else { continue };
-        let wall = |bin: usize, w: &Wall| w.height_mm + w.slope * view.axial_of(bin as f64 + 0.5);
-        let height = (a.toe..view.bins - b.toe)
-            .map(|bin| {
-                let d = view.medians[k * view.bins + bin];
-                (d - wall(bin, a)).abs().min((d - wall(bin, b)).abs())
-            })
-            .filter(|h| h.is_finite())
-            .fold(0.0, f64::max);
-        let strip = (height / view.bin_mm).ceil() as usize;
-        a.toe = a.toe.saturating_sub(strip);
-        b.toe = b.toe.saturating_sub(strip);
-    }
-}
-
-impl Walls {
-    fn toes(&self, view: &View, sector: usize) -> Option<(f64, f64)> {
-        let (a, b) = (*self.sectors.get(sector)?)?;
-        Some((view.axial_of(a.toe as f64), view.axial_of((view.bins - b.toe) as f64)))
-    }
-
-    fn labels(&self, view: &View) -> Vec<u8> {
-        let toes: Vec<Option<(f64, f64)>> = (0..view.sectors).map(|k| self.toes(view, k)).collect();
-        let label = |i: usize| -> Option<Label> {
-            let (a, z, d) = view.place(i)?;
-            let k = view.sector(a)?;
-            let ((first, second), (low, high)) = (self.sectors[k]?, toes[k]?);
-            if z > low && z < high {
-                return Some(Label::Bead);
-            }
-            let (wall, label) = if z <= low { (first, Label::ReferenceWall) } else { (second, Label::OtherWall) };
-            let spread = (self.noise_mm.powi(2) + wall.unevenness_mm2).sqrt();
-            ((d - wall.height_mm - wall.slope * z).abs() <= WALL_SIGMAS * spread).then_some(label)
-        };
-        threads::map_ranges(view.unrolled.angle_rad.len(), |range| {
-            range.map(|i| label(i).unwrap_or(Label::None) as u8).collect::<Vec<u8>>()
-        })
-        .concat()
-    }
-
-    /// Axial coordinate in `frame` of the middle between the toes: mean over the sectors.
-    fn centreline(&self, view: &View, coarse: &PipeFrame, frame: &PipeFrame) -> f64 {
-        let square = coarse.axis.cross(&coarse.zero);
-        let (mut sum, mut count) = (0.0, 0.0);
-        for k in 0..view.sectors {
-            if let Some((low, high)) = self.toes(view, k) {
-                let angle = view.middle_rad + view.start_rad + (k as f64 + 0.5) * view.sector_rad;
-                let p = coarse.origin_mm
-                    + coarse.axis * (low + high) / 2.0
-                    + (coarse.zero * angle.cos() + square * angle.sin()) * coarse.radius_mm;
-                sum += frame.unroll(&p.into())[1];
-                count += 1.0;
-            }
-        }
-        sum / f64::max(count, 1.0)
-    }
+/// Points of the reference wall with the weld's shrinkage taken out, so that they lie on a cylinder.
+fn undrawn(
+    points: &[[f64; 3]],
+    labels: &[u8],
+    unrolled: &Unrolled,
+    sections: &Sections,
+    coarse: &PipeFrame,
+    thickness_mm: f64,
+) -> Vec<[f64; 3]> {
+    // One amplitude: that of a single station is known too badly.
+    let mut all: Vec<f64> =
+        sections.stations.iter().filter_map(|s| s.walls[0].map(|run| run.shrinkage)).collect();
+    let drawn = if all.is_empty() { 0.0 } else { median(&mut all) };
+    let mut middles: Vec<f64> = sections.stations.iter().filter_map(|s| s.toes_mm.map(|t| 0.5 * (t[0] + t[1]))).collect();
+    let middle = if middles.is_empty() { 0.0 } else { median(&mut middles) };
+    let square = coarse.axis.cross(&coarse.zero);
+    let wall = (0..points.len()).filter(|&i| labels[i] == Label::ReferenceWall as u8);
+    wall.map(|i| {
+        let (sin, cos) = f64::from(unrolled.angle_rad[i]).sin_cos();
+        let z = f64::from(unrolled.axial_mm[i]) - middle;
+        let lift = -drawn * shell_term(z, coarse.radius_mm, thickness_mm);
+        (Vec3::from(points[i]) + (coarse.zero * cos + square * sin) * lift).into()
+    })
+    .collect()
 }
 
 /// The reference wall's cylinder by orthogonal distance, with what its arc allows: a free radius where it is determined
 /// to better than the pipe's delivery tolerance, else the nominal one.
-fn reference_frame(
-    points: &[[f64; 3]],
-    labels: &[u8],
-    coarse: &PipeFrame,
-    nominal: &Nominal,
-) -> Result<(PipeFrame, bool)> {
-    let wall: Vec<[f64; 3]> =
-        std::iter::zip(points, labels).filter(|(_, l)| **l == Label::ReferenceWall as u8).map(|(p, _)| *p).collect();
+fn reference_frame(wall: &[[f64; 3]], coarse: &PipeFrame, nominal: &Nominal) -> Result<(PipeFrame, bool)> {
     crate::error::require_count("points of the reference wall", 100, wall.len())?;
     let sample: Vec<[f64; 3]> = wall.iter().step_by(wall.len().div_ceil(FIT_POINTS)).copied().collect();
     let start = cylinder::Cylinder { point_mm: coarse.origin_mm, axis: coarse.axis, radius_mm: coarse.radius_mm };

@@ -10,7 +10,8 @@
 //!
 //! Each shot has a reference of its own, so a robot's pose error moves both walls of a shot alike and leaves h; the
 //! parameters of h belong to the pipe and are common to all shots. What pipes have beyond that (ovality, dents) enters as
-//! Legendre polynomials over each shot's arc. A group of terms is admitted only where the data ask for it (Schwarz's
+//! Legendre polynomials over each shot's arc; what the weld drew each wall in enters as the bending of a thin shell
+//! ([`crate::sections`]), which belongs to no step. A group of terms is admitted only where the data ask for it (Schwarz's
 //! criterion). The step at the seam is `h(θ, 0)`: both walls extrapolated to the seam.
 //! Where a bin of the profile departs from the model significantly, the departure is added: a local step is not
 //! smoothed away.
@@ -32,6 +33,7 @@ use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
+use crate::sections::shell_term;
 use crate::segment::Label;
 use crate::statistics::median;
 use crate::threads;
@@ -51,6 +53,8 @@ pub struct Shot<'a> {
     pub radius_mm: f64,
     /// Distance between the toes.
     pub bead_width_mm: f64,
+    /// Of the nominal wall.
+    pub thickness_mm: f64,
 }
 
 /// What the caller knows of further standard uncertainties (k = 1).
@@ -104,8 +108,12 @@ pub struct Step {
     pub radius_difference_mm: (f64, f64),
     /// Offset of the other wall's axis at the seam (towards angle 0, towards 90°).
     pub axis_offset_mm: [f64; 2],
+    /// Standard uncertainty of that offset along its own direction.
+    pub axis_offset_standard_mm: f64,
     /// Angle between the walls' axes.
     pub tilt_rad: f64,
+    /// Its standard uncertainty.
+    pub tilt_standard_rad: f64,
     /// Legendre degree up to which the walls' shape was needed (2: cylinders suffice).
     pub shape_degree: usize,
     /// Rms of the cells about the model.
@@ -152,6 +160,8 @@ struct Terms {
     tilt: bool,
     /// Highest Legendre degree of the walls' own shape; 2 means none.
     shape: usize,
+    /// What the weld drew each wall in, see [`crate::sections`].
+    shell: bool,
 }
 
 impl Terms {
@@ -181,6 +191,8 @@ struct Model<'a> {
     terms: Terms,
     /// Axial unit, so that all columns have the same size.
     scale_mm: f64,
+    /// Of the nominal wall: the shell term's length comes from it.
+    thickness_mm: f64,
 }
 
 const CYLINDER: usize = 5;
@@ -194,8 +206,12 @@ impl Model<'_> {
         2 + usize::from(self.terms.radius) + 2 * usize::from(self.terms.tilt) + self.arcs.len() * self.shapes()
     }
 
+    fn shells(&self) -> usize {
+        if self.terms.shell { 2 } else { 0 }
+    }
+
     fn columns(&self) -> usize {
-        self.arcs.len() * (CYLINDER + self.shapes()) + self.step_columns()
+        self.arcs.len() * (CYLINDER + self.shapes()) + self.shells() + self.step_columns()
     }
 
     /// The row of the reference wall's correction, into its columns of `row`.
@@ -215,7 +231,7 @@ impl Model<'_> {
     fn step_row(&self, shot: Option<usize>, angle: f64, axial: f64, row: &mut [f64]) {
         let (sin, cos) = angle.sin_cos();
         let z = axial / self.scale_mm;
-        let own = &mut row[self.arcs.len() * (CYLINDER + self.shapes())..];
+        let own = &mut row[self.arcs.len() * (CYLINDER + self.shapes()) + self.shells()..];
         own[..2].copy_from_slice(&[cos, sin]);
         let mut next = 2;
         if self.terms.radius {
@@ -236,6 +252,10 @@ impl Model<'_> {
     fn row(&self, cell: &Cell) -> Vec<f64> {
         let mut row = vec![0.0; self.columns()];
         self.reference_row(cell.shot, cell.angle, cell.axial, &mut row);
+        if self.terms.shell {
+            let at = self.arcs.len() * (CYLINDER + self.shapes()) + usize::from(cell.other);
+            row[at] = shell_term(cell.axial, self.arcs[cell.shot].radius_mm, self.thickness_mm);
+        }
         if cell.other {
             self.step_row(Some(cell.shot), cell.angle, cell.axial, &mut row);
         }
@@ -613,13 +633,15 @@ pub fn measure(shots: &[Shot], known: &Known) -> Result<Step> {
             return Err(Error::Shape { what: "shot", expected, got });
         }
         crate::error::require_positive("radius_mm", shot.radius_mm)?;
+        crate::error::require_positive("thickness_mm", shot.thickness_mm)?;
     }
     let arcs = shots.iter().map(arc_of).collect::<Result<Vec<Arc>>>()?;
     let grids = (0..shots.len()).map(|k| grid_of(k, &shots[k], &arcs[k])).collect::<Result<Vec<Grid>>>()?;
     let cell_mm = grids.iter().map(|g| g.cell_mm).fold(0.0, f64::max);
     let cells: Vec<Cell> = grids.into_iter().flat_map(|g| g.cells).collect();
     let scale_mm = cells.iter().map(|c| c.axial.abs()).fold(0.0, f64::max);
-    let model = |terms: Terms| Model { arcs: &arcs, terms, scale_mm };
+    let thickness_mm = shots.iter().map(|s| s.thickness_mm).sum::<f64>() / shots.len() as f64;
+    let model = |terms: Terms| Model { arcs: &arcs, terms, scale_mm, thickness_mm };
 
     // Plain least squares first, to see what the walls' unevenness is like.
     let plain = Whitener::identity(cells.len());
@@ -686,6 +708,13 @@ pub fn measure(shots: &[Shot], known: &Known) -> Result<Step> {
     };
     let at = wide.parameters.len() - model(wide_terms).step_columns();
     let p = &wide.parameters.as_slice()[at..];
+    // Of a vector's length: its covariance along its own direction.
+    let along = |k: usize| {
+        let v = nalgebra::Vector2::new(p[k], p[k + 1]);
+        let u = v.try_normalize(0.0).unwrap_or(nalgebra::Vector2::x());
+        let c = wide.covariance.fixed_view::<2, 2>(at + k, at + k);
+        u.dot(&(c * u)).max(0.0).sqrt()
+    };
     Ok(Step {
         mean_mm,
         median_mm,
@@ -695,6 +724,8 @@ pub fn measure(shots: &[Shot], known: &Known) -> Result<Step> {
         coverage_deg: BIN_DEG * profile.len() as f64,
         radius_difference_mm: (p[2], wide.covariance[(at + 2, at + 2)].max(0.0).sqrt()),
         axis_offset_mm: [p[0], p[1]],
+        axis_offset_standard_mm: along(0),
+        tilt_standard_rad: along(3) / scale_mm,
         tilt_rad: (p[3].hypot(p[4]) / scale_mm).atan(),
         shape_degree: terms.shape,
         residual_rms_mm: (chosen.residuals.iter().map(|r| r * r).sum::<f64>() / cells.len() as f64).sqrt(),
@@ -713,10 +744,11 @@ fn choose<'a>(model: &impl Fn(Terms) -> Model<'a>, cells: &[Cell], whitener: &Wh
         let s = solve(&m, cells, whitener).ok()?;
         Some(count * (s.cost / count).max(f64::MIN_POSITIVE).ln() + m.columns() as f64 * count.ln())
     };
-    let mut terms = Terms { radius: false, tilt: false, shape: 2 };
+    let mut terms = Terms { radius: false, tilt: false, shape: 2, shell: false };
     let mut best = criterion(terms).unwrap_or(f64::INFINITY);
     loop {
-        let mut candidates = vec![Terms { radius: true, ..terms }, Terms { tilt: true, ..terms }];
+        let mut candidates =
+            vec![Terms { radius: true, ..terms }, Terms { tilt: true, ..terms }, Terms { shell: true, ..terms }];
         // Ovality is even: a step of one degree alone may not pay.
         candidates
             .extend((terms.shape + 1..=(terms.shape + 2).min(MAX_SHAPE_DEGREE)).map(|shape| Terms { shape, ..terms }));

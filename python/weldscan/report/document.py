@@ -137,6 +137,7 @@ def _step(step: StepResult | None) -> dict[str, Any]:
         "max_abs": step.max_abs_mm,
         "max_abs_at_deg": step.max_abs_at_deg,
         "expanded_uncertainty": step.expanded_uncertainty_mm,
+        "judged": step.judged,
         "histogram": histogram.step_mm if histogram else None,
         "histogram_u": histogram.expanded_uncertainty_mm if histogram else None,
         "coverage_deg": step.coverage_deg,
@@ -149,12 +150,18 @@ def _step(step: StepResult | None) -> dict[str, Any]:
     return document
 
 
+BOTH_STEPS = ("wall_step_mm", "wall_u_mm", "edge_step_mm", "edge_u_mm")
+
+
 def profile(step: StepResult | None, part: Mapping[str, Any]) -> list[dict[str, float]]:
-    """The measured bins: those that hold a number with its uncertainty."""
+    """The measured bins: those that hold a number with its uncertainty. `step_mm` is the judged one of the two steps."""
     if step is None:
         return []
-    rows = zip(*(column[step.measured].tolist() for column in (step.angle_deg, step.step_mm, step.u_mm)), strict=True)
-    return [{"angle_deg": angle, **_along(angle, part), "step_mm": value, "u_mm": u} for angle, value, u in rows]
+    columns: dict[str, Any] = {"angle_deg": step.angle_deg, "step_mm": step.step_mm, "u_mm": step.u_mm}
+    columns |= {name: column for name in BOTH_STEPS if (column := getattr(step, name)) is not None}
+    rows = zip(*(column[step.measured].tolist() for column in columns.values()), strict=True)
+    named = [dict(zip(columns, row, strict=True)) for row in rows]
+    return [_along(row["angle_deg"], part) | row for row in named]
 
 
 def _along(angle_deg: float, part: Mapping[str, Any]) -> dict[str, float]:
@@ -165,10 +172,11 @@ def _along(angle_deg: float, part: Mapping[str, Any]) -> dict[str, float]:
 def profile_csv(step: StepResult | None, part: Mapping[str, Any]) -> str:
     """The profile as rows of text."""
     text = io.StringIO()
-    text.write("angle_deg,step_mm,u_mm,along_mm\n")
+    names = ("angle_deg", "step_mm", "u_mm", "along_mm", *BOTH_STEPS)
+    text.write(",".join(names) + "\n")
     for row in profile(step, part):
-        along = f"{row['along_mm']:.3f}" if "along_mm" in row else ""
-        text.write(f"{row['angle_deg']:g},{row['step_mm']:.5f},{row['u_mm']:.5f},{along}\n")
+        cells = (f"{row[name]:.5f}" if name in row else "" for name in names[1:])
+        text.write(",".join([f"{row['angle_deg']:g}", *cells]) + "\n")
     return text.getvalue()
 
 

@@ -12,6 +12,7 @@ use super::{Whole, compute, floats, parts, raise};
 use crate::Vec3;
 use crate::error::Error;
 use crate::place::{self, Scan};
+use crate::sections::Station;
 use crate::segment::{self, Nominal, Segmentation};
 use crate::step::{self, Known, Shot};
 
@@ -75,6 +76,53 @@ impl WeldShot {
     #[getter]
     fn deviation_mm<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
         PyArray1::from_slice(py, &self.0.unrolled.deviation_mm)
+    }
+    /// (H * W,) uint8: what became of each point: 0 none, 1 wall, 2 transition, 3 cap, 4 gated, 5 off line, 6 other.
+    #[getter]
+    fn fates<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u8>> {
+        PyArray1::from_slice(py, &self.0.fates)
+    }
+    /// The cross-sections along the seam: a dict of arrays over the stations (n,), NaN for what is not known: `angle_deg`
+    /// (middle of the station, [0, 360)), `seen` (bool), `kind` (uint8: 0 unknown, 1 raised, 2 hollow, 3 flush), `by_course` (bool: the
+    /// toes are those of the seam's course), `toes_mm` (n, 2) from the seam's centreline, reference side first, `height_mm` of
+    /// the cap, `edge_step_mm` (other over reference, right beside the toes), `edge_standard_mm` (k = 1), `edge_hull_mm` (what the
+    /// choice of the toes may hide, in full), `undisturbed_mm` (n, 2): from where outward the walls are undisturbed,
+    /// `departure_mm` (n, 2): of the transition from the straight wall, `wall_step_mm` of both straight walls.
+    #[getter]
+    fn sections<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let stations = &self.0.sections.stations;
+        let out = PyDict::new(py);
+        let one = |pick: &dyn Fn(&Station) -> Option<f64>| -> Bound<'py, PyArray1<f64>> {
+            stations.iter().map(|s| pick(s).unwrap_or(f64::NAN)).collect::<Vec<f64>>().into_pyarray(py)
+        };
+        let two = |pick: &dyn Fn(&Station) -> [Option<f64>; 2]| -> PyResult<Bound<'py, PyArray2<f64>>> {
+            let flat: Vec<f64> = stations.iter().flat_map(|s| pick(s).map(|v| v.unwrap_or(f64::NAN))).collect();
+            flat.into_pyarray(py).reshape([stations.len(), 2])
+        };
+        out.set_item("angle_deg", one(&|s| Some(s.angle_rad.to_degrees().rem_euclid(360.0))))?;
+        out.set_item("seen", stations.iter().map(|s| s.seen).collect::<Vec<bool>>().into_pyarray(py))?;
+        out.set_item("kind", stations.iter().map(|s| s.kind as u8).collect::<Vec<u8>>().into_pyarray(py))?;
+        out.set_item("by_course", stations.iter().map(|s| s.by_course).collect::<Vec<bool>>().into_pyarray(py))?;
+        out.set_item("toes_mm", two(&|s| s.toes_mm.map_or([None; 2], |t| t.map(Some)))?)?;
+        out.set_item("height_mm", one(&|s| s.toes_mm.map(|_| s.height_mm)))?;
+        out.set_item("edge_step_mm", one(&|s| s.edge.map(|e| e.step_mm)))?;
+        out.set_item("edge_standard_mm", one(&|s| s.edge.map(|e| e.standard_mm)))?;
+        out.set_item("edge_hull_mm", one(&|s| s.edge.map(|e| e.hull_mm)))?;
+        out.set_item("undisturbed_mm", two(&|s| s.undisturbed_mm)?)?;
+        out.set_item("departure_mm", two(&|s| s.departure_mm.map(Some))?)?;
+        out.set_item("wall_step_mm", one(&|s| s.wall_step_mm))?;
+        Ok(out)
+    }
+    /// Length of a station of `sections` along the seam, mm.
+    #[getter]
+    fn station_mm(&self) -> f64 {
+        self.0.sections.station_mm
+    }
+    /// Why the weld's edges may not be what they seem: a list of (code, angle in degrees, text).
+    #[getter]
+    fn doubts(&self) -> Vec<(&'static str, f64, String)> {
+        let doubts = self.0.sections.doubts.iter();
+        doubts.map(|d| (d.code, d.angle_rad.to_degrees().rem_euclid(360.0), d.text.clone())).collect()
     }
     fn __repr__(&self) -> String {
         let count = |l: u8| self.0.labels.iter().filter(|x| **x == l).count();
@@ -154,6 +202,7 @@ fn measure_step<'py>(
             labels: &s.0.labels,
             radius_mm: s.0.frame.radius_mm,
             bead_width_mm: s.0.bead_width_mm,
+            thickness_mm: s.0.thickness_mm,
         })
         .collect();
     let known = Known { angle_rad: angle_sigma_rad };
@@ -167,7 +216,9 @@ fn measure_step<'py>(
     out.set_item("coverage_deg", step.coverage_deg)?;
     out.set_item("radius_difference_mm", step.radius_difference_mm)?;
     out.set_item("axis_offset_mm", step.axis_offset_mm)?;
+    out.set_item("axis_offset_standard_mm", step.axis_offset_standard_mm)?;
     out.set_item("tilt_rad", step.tilt_rad)?;
+    out.set_item("tilt_standard_rad", step.tilt_standard_rad)?;
     out.set_item("shape_degree", step.shape_degree)?;
     out.set_item("residual_rms_mm", step.residual_rms_mm)?;
     out.set_item("correlation_mm", step.correlation_mm)?;
@@ -252,7 +303,32 @@ fn place_shots<'py>(py: Python<'py>, shots: &Bound<'py, PyAny>) -> PyResult<Plac
 type PlacedShot<'py> =
     (PyRef<'py, WeldShot>, PyReadonlyArrayDyn<'py, f64>, PyReadonlyArray2<'py, f64>, PyReadonlyArray1<'py, f32>, Whole);
 
+/// Counts what became of every pixel of a part shot, bin by bin along the seam.
+///
+/// shot: WeldShot. reason: (H, W) uint8, as `PhaseMap.reason`. scanner: whose camera took it. Returns two (180, 12) uint32
+/// arrays over the bins of 2 degrees (centred on even ones) and `weldscan.result.FATES`: of all pixels, and of those on the
+/// weld and within 8 mm of its toes. A pixel without a point lies where its ray meets the reference wall's cylinder. Raises
+/// InputError where the arrays are not those of one image. Source: `crates/weldcore/src/seam_fates.rs`.
+#[pyfunction]
+fn seam_fates<'py>(
+    py: Python<'py>,
+    shot: PyRef<'py, WeldShot>,
+    reason: PyReadonlyArray2<'py, u8>,
+    scanner: PyRef<'py, super::scanner::PyScanner>,
+) -> PyResult<(Bound<'py, PyArray2<u32>>, Bound<'py, PyArray2<u32>>)> {
+    let strided = |_| raise(py, &Error::Shape { what: "reason", expected: "contiguous".into(), got: "strided".into() });
+    let reasons = reason.as_slice().map_err(strided)?;
+    let (shot, camera) = (&shot.0, &scanner.scanner.camera);
+    let found = compute(py, || crate::seam_fates::seam_fates(shot, reasons, camera))?;
+    let table = |rows: Vec<[u32; crate::seam_fates::FATES]>| {
+        let n = rows.len();
+        rows.into_flattened().into_pyarray(py).reshape([n, crate::seam_fates::FATES])
+    };
+    Ok((table(found.all)?, table(found.near)?))
+}
+
 pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_function(wrap_pyfunction!(seam_fates, m)?)?;
     m.add_class::<WeldShot>()?;
     m.add_function(wrap_pyfunction!(segment_weld, m)?)?;
     m.add_function(wrap_pyfunction!(measure_step, m)?)?;

@@ -1,0 +1,293 @@
+"""The seam as a whole: what became of every pixel, how much was seen, what a gauge would read, and what bars a PASS."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldscan._weldcore import Scanner, seam_fates
+from weldscan.part_views import PartView
+from weldscan.result import FATES, Coverage, Finding, SeamBin, bar
+
+Floats = NDArray[np.float64]
+
+BINS, BIN_DEG = 180, 2.0
+# Beyond this angle between a surface and the rays of camera or projector nobody is surprised to see no fringes.
+STEEPEST_DEG = 50.0
+# So much of either wall beside its toe must be in view for a bin to be expected: what the edge is read from.
+BESIDE_MM = 6.0
+# A pixel's width of the image's border is not relied on.
+BORDER_PX = 4.0
+# Of a bin's points: holes have edges, and dust lies on any part. More is a surface that nobody recognised.
+UNEXPLAINED_PART = 0.10
+# Of the pixels at the weld of a bin: fewer measured ones are no sample of its surface any more.
+SATURATED_PART, LOST_PART = 0.50, 0.70
+# Three sigma of what is stated with k = 2.
+CONTRADICTION = 1.5
+# A bin with fewer pixels is the sliver of a view.
+LEAST_PIXELS = 50
+INDEX = {name: k for k, name in enumerate(FATES)}
+UNEXPLAINED = [INDEX[name] for name in ("gated", "off_line", "other")]
+POINTS = [INDEX[name] for name in ("wall", "transition", "cap", "gated", "off_line", "other")]
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeProfile:
+    """The edge step by bin: how far the surfaces right beside the toes are apart."""
+
+    step_mm: Floats
+    """(180,), NaN where it was not read."""
+    u_mm: Floats
+    """(180,), expanded, k = 2, with what the choice of the toes may hide in full."""
+    confirmed_mm: float
+    """The largest |step| - U that two neighbouring stations share: a single one may be a drop of spatter."""
+
+    @property
+    def worst(self) -> int | None:
+        """The bin with the largest upper bound."""
+        upper = np.abs(self.step_mm) + self.u_mm
+        return None if np.isnan(upper).all() else int(np.nanargmax(upper))
+
+    @property
+    def judged(self) -> tuple[float, float] | None:
+        """The largest step and its U: no lower than what two neighbours share."""
+        if self.worst is None:
+            return None
+        value, u = abs(float(self.step_mm[self.worst])), float(self.u_mm[self.worst])
+        return value, max(u, value - max(self.confirmed_mm, 0.0))
+
+
+    def contradict(self, bins: NDArray[np.intp], wall_mm: Floats, wall_u_mm: Floats) -> bool:
+        """Whether the edges tell another step than the walls: beyond what both leave open (k = 3 of their joint
+        uncertainty, the hull once) in two bins beside each other."""
+        off = np.abs(self.step_mm[bins] - wall_mm) - (CONTRADICTION * np.hypot(self.u_mm[bins], wall_u_mm))
+        beyond = set(bins[off > 0].tolist())
+        return any((k + 1) % BINS in beyond for k in beyond)
+
+
+def edge_profile(views: Sequence[PartView]) -> EdgeProfile:
+    """The edge step of all shots: in each bin by the shot that tells it best, there the reading furthest from zero.
+
+    Args:
+        views: the segmented part shots.
+    """
+    best_u = np.full(BINS, np.inf)
+    step, u = np.full(BINS, np.nan), np.full(BINS, np.nan)
+    confirmed = 0.0
+    for view in views:
+        sections = view.shot.sections
+        read, expanded = sections["edge_step_mm"], 2 * sections["edge_standard_mm"] + sections["edge_hull_mm"]
+        upper, lower = np.abs(read) + expanded, np.abs(read) - expanded
+        # The same sign: two that stand off in opposite directions confirm nothing.
+        pairs = np.where(np.sign(read[1:]) == np.sign(read[:-1]), np.fmin(lower[1:], lower[:-1]), np.nan)
+        if len(pairs) and not np.isnan(pairs).all():
+            confirmed = max(confirmed, float(np.nanmax(pairs)))
+        for k, stations in _stations_by_bin(view).items():
+            known = stations[np.isfinite(upper[stations])]
+            if not len(known):
+                continue
+            typical = float(np.median(expanded[known]))
+            if typical < best_u[k]:
+                worst = known[int(np.argmax(upper[known]))]
+                best_u[k], step[k], u[k] = typical, read[worst], expanded[worst]
+    return EdgeProfile(step, u, confirmed)
+
+
+def _stations_by_bin(view: PartView) -> dict[int, NDArray[np.intp]]:
+    """The stations that reach into each bin."""
+    shot = view.shot
+    angles = shot.sections["angle_deg"]
+    half = BIN_DEG / 2 + math.degrees(shot.station_mm / 2 / shot.radius_mm)
+    found = {}
+    for k in range(BINS):
+        off = (angles - BIN_DEG * k + 180) % 360 - 180
+        near = np.flatnonzero(np.abs(off) < half)
+        if len(near):
+            found[k] = near
+    return found
+
+
+def expected_bins(views: Sequence[PartView], scanner: Scanner) -> set[int]:
+    """The bins that these views should have seen, by poses, lenses and the pipe: whole, with the walls beside the weld,
+    in both images, and not too steep to either ray."""
+    expected: set[int] = set()
+    projector = np.asarray(scanner.camera_from_projector)[:3, 3]
+    for view in views:
+        shot = view.shot
+        toes = shot.sections["toes_mm"]
+        if np.isnan(toes).all():
+            continue
+        low, high = np.nanmedian(toes[:, 0]) - BESIDE_MM, np.nanmedian(toes[:, 1]) + BESIDE_MM
+        margin = BIN_DEG / 2 + math.degrees(shot.station_mm / shot.radius_mm)
+        square = np.cross(shot.axis, shot.zero)
+        inside = np.ones(BINS, bool)
+        for off in (-margin, 0.0, margin):
+            angle = np.radians(BIN_DEG * np.arange(BINS) + off)[:, None]
+            normal = np.cos(angle) * shot.zero + np.sin(angle) * square
+            for along in (low, 0.0, high):
+                points = shot.origin_mm + shot.axis * along + normal * shot.radius_mm
+                inside &= points[:, 2] > 0
+                for pixels, lens in (
+                    (scanner.camera.project(points), scanner.camera),
+                    (scanner.project_to_projector(points), scanner.projector),
+                ):
+                    size = np.array([lens.width, lens.height]) - 1 - BORDER_PX
+                    inside &= ((pixels >= BORDER_PX) & (pixels <= size)).all(axis=1)
+                for eye in (np.zeros(3), projector):
+                    ray = eye - points
+                    cosine = np.einsum("ij,ij->i", ray, normal) / np.linalg.norm(ray, axis=1)
+                    inside &= cosine > math.cos(math.radians(STEEPEST_DEG))
+        expected |= set(np.flatnonzero(inside).tolist())
+    return expected
+
+
+def coverage_of(measured: Iterable[int], expected: Iterable[int], required_deg: float | None, by: str) -> Coverage:
+    """How much was seen of what had to be.
+
+    Args:
+        measured: bins with a step.
+        expected: bins that the views should have seen.
+        required_deg: of the session or the option; None: what was expected.
+        by: session, option or views.
+    """
+    seen, wanted = set(measured), set(expected)
+    seen_deg = BIN_DEG * len(seen)
+    if required_deg is None:
+        return Coverage(seen_deg, BIN_DEG * len(wanted), by, _arcs(wanted - seen))
+    missing = wanted - seen
+    if seen_deg < required_deg:
+        missing = set(range(BINS)) - seen
+    return Coverage(seen_deg, required_deg, by, _arcs(missing))
+
+
+def _arcs(bins: set[int]) -> tuple[tuple[float, float], ...]:
+    """Runs of bins as arcs, in [0, 360), from and to in the direction of growing angle."""
+    if len(bins) >= BINS:
+        return ((0.0, 360.0),)
+    starts = [k for k in sorted(bins) if (k - 1) % BINS not in bins]
+    arcs = []
+    for start in starts:
+        end = start
+        while (end + 1) % BINS in bins:
+            end = (end + 1) % BINS
+        arcs.append((float((BIN_DEG * start - BIN_DEG / 2) % 360), float((BIN_DEG * end + BIN_DEG / 2) % 360)))
+    return tuple(arcs)
+
+
+@dataclass(frozen=True, eq=False)
+class Seam:
+    """Every bin of the seam, and what there is to say of them."""
+
+    bins: tuple[SeamBin, ...]
+    coverage: Coverage
+    findings: tuple[Finding, ...]
+
+
+def seam_of(
+    views: Sequence[PartView],
+    scanner: Scanner,
+    measured: Iterable[int],
+    radius_mm: float,
+    required_deg: float | None = None,
+    required_by: str = "views",
+) -> Seam:
+    """The fates of all pixels by bin, the coverage, and the bars that follow from them and from the cross-sections.
+
+    Args:
+        views: the segmented part shots.
+        scanner: that took them.
+        measured: bins of 2 degrees with a step.
+        radius_mm: of the pipe, nominal.
+        required_deg: least coverage, where session or option ask for one.
+        required_by: session, option or views.
+    """
+    measured = set(measured)
+    tables = [seam_fates(view.shot, np.ascontiguousarray(view.reason), scanner) for view in views]
+    every = np.sum([t[0] for t in tables], axis=0, dtype=np.int64) if tables else np.zeros((BINS, len(FATES)), int)
+    expected = expected_bins(views, scanner)
+    coverage = coverage_of(measured, expected, required_deg, required_by)
+    wanted = set(range(BINS)) if coverage.required_deg >= 360 else expected
+    caps = _caps(views)
+    bins = tuple(
+        SeamBin(
+            angle_deg=BIN_DEG * k,
+            along_mm=math.radians(BIN_DEG * k) * radius_mm,
+            measured=k in measured,
+            fate=dict(zip(FATES, every[k].tolist(), strict=True)),
+            cap_width_mm=caps[k][1] - caps[k][0] if k in caps else None,
+            toes_mm=caps.get(k),
+        )
+        for k in range(BINS)
+        if k in wanted or k in measured or every[k][POINTS].sum() >= LEAST_PIXELS
+    )
+    findings = [*_of_coverage(coverage)]
+    for view, (whole, near) in zip(views, tables, strict=True):
+        findings += _of_fates(view.name, whole, near)
+        findings += [
+            bar(code, f"{view.name}: {text} (at {angle:.0f}°)", view.name, angle)
+            for code, angle, text in view.shot.doubts
+        ]
+    return Seam(bins, coverage, tuple(findings))
+
+
+def _caps(views: Sequence[PartView]) -> Mapping[int, tuple[float, float]]:
+    found: dict[int, tuple[float, float]] = {}
+    for view in views:
+        toes = view.shot.sections["toes_mm"]
+        for k, stations in _stations_by_bin(view).items():
+            known = toes[stations][np.isfinite(toes[stations]).all(axis=1)]
+            if len(known):
+                low, high = np.median(known, axis=0).tolist()
+                # Where two shots saw it, the wider one: it is the one to worry about.
+                if k not in found or high - low > found[k][1] - found[k][0]:
+                    found[k] = (low, high)
+    return found
+
+
+def _of_coverage(coverage: Coverage) -> list[Finding]:
+    if coverage.enough:
+        return []
+    arcs = ", ".join(f"{a:.0f}° to {b:.0f}°" for a, b in coverage.gaps[:4]) + (" ..." if len(coverage.gaps) > 4 else "")
+    why = {"session": "the session asks for", "option": "--require-coverage asks for"}.get(
+        coverage.required_by, "these views should have seen"
+    )
+    at = (coverage.gaps[0][0] + BIN_DEG / 2) % 360 if coverage.gaps else None
+    text = f"{coverage.seen_deg:.0f}° of the seam were seen, {why} {coverage.required_deg:.0f}°"
+    return [bar("coverage", f"{text}: nothing is known of {arcs}" if arcs else text, None, at)]
+
+
+def _of_fates(name: str, whole: NDArray[np.uint32], near: NDArray[np.uint32]) -> list[Finding]:
+    """Bars for one shot: points that no wall took, and too many pixels lost at the weld."""
+    findings = []
+    for table, where in ((near, "at the weld"), (whole, "of the view")):
+        points, odd = table[:, POINTS].sum(axis=1), table[:, UNEXPLAINED].sum(axis=1)
+        share = np.where(points >= LEAST_PIXELS, odd / np.maximum(points, 1), 0.0)
+        if (share > UNEXPLAINED_PART).any():
+            k = int(np.argmax(share))
+            text = (
+                f"{name}: {odd[k]} of {points[k]} points {where} at {BIN_DEG * k:.0f}° belong neither to a wall nor to the "
+                "cap: what are they?"
+            )
+            findings.append(bar("points-without-wall", text, name, BIN_DEG * k))
+            break
+    total = near.sum(axis=1)
+    saturated = np.where(total >= LEAST_PIXELS, near[:, INDEX["saturated"]] / np.maximum(total, 1), 0.0)
+    if (saturated > SATURATED_PART).any():
+        k = int(np.argmax(saturated))
+        text = (
+            f"{name}: {100 * saturated[k]:.0f} % of the pixels at the weld at {BIN_DEG * k:.0f}° are saturated: what is left "
+            "is no sample of its surface; scan with a shorter exposure"
+        )
+        findings.append(bar("saturation", text, name, BIN_DEG * k))
+    lost = 1 - near[:, POINTS].sum(axis=1) / np.maximum(total, 1)
+    # Where hardly anything was measured there is no step either, and the coverage says so.
+    some = (near[:, POINTS].sum(axis=1) >= LEAST_PIXELS) & (lost > LOST_PART) & (saturated <= SATURATED_PART)
+    if some.any():
+        k = int(np.argmax(np.where(some, lost, 0.0)))
+        text = f"{name}: {100 * lost[k]:.0f} % of the pixels at the weld at {BIN_DEG * k:.0f}° were not measured"
+        findings.append(bar("coverage", text, name, BIN_DEG * k))
+    return findings

@@ -26,7 +26,7 @@ const CONVERGED_MM: f64 = 1e-8;
 /// Cosine of light or view below which a surface shows no fringes: 75 degrees.
 pub const GRAZING: f64 = 0.259;
 /// For the slopes at the hit, mm.
-const DIFFERENCE_MM: f64 = 0.01;
+const DIFFERENCE_MM: f64 = 0.003;
 /// Rows that one task casts.
 const BAND: usize = 8;
 
@@ -94,6 +94,8 @@ struct Ray {
 #[derive(Clone, Copy)]
 struct Place {
     above: f64,
+    /// Height of the surface over the nominal radius.
+    height: f64,
     angle: f64,
     z: f64,
     /// Cosine and sine of the angle.
@@ -120,10 +122,10 @@ impl Ray {
 impl Surface {
     #[inline]
     fn place(&self, p: &Vec3) -> Place {
-        let rho = p.x.hypot(p.y);
+        let rho = (p.x * p.x + p.y * p.y).sqrt();
         let (angle, outward) = (p.y.atan2(p.x), [p.x / rho, p.y / rho]);
-        let (f, part) = self.height_towards((angle, outward), p.z);
-        Place { above: rho - self.scene.radius_mm - f, angle, z: p.z, outward, part }
+        let (height, part) = self.height_towards((angle, outward), p.z);
+        Place { above: rho - self.scene.radius_mm - height, height, angle, z: p.z, outward, part }
     }
 
     /// The first place where a ray from outside meets the surface.
@@ -184,12 +186,10 @@ impl Surface {
 
     /// The outward normal at a place of the surface.
     fn normal(&self, place: &Place) -> Vec3 {
-        let rho = self.scene.radius_mm + self.height_towards((place.angle, place.outward), place.z).0;
-        let turn = DIFFERENCE_MM / rho;
-        let around = (self.height(place.angle + turn, place.z).0 - self.height(place.angle - turn, place.z).0)
-            / (2.0 * DIFFERENCE_MM);
-        let height = |dz: f64| self.height_towards((place.angle, place.outward), place.z + dz).0;
-        let along = (height(DIFFERENCE_MM) - height(-DIFFERENCE_MM)) / (2.0 * DIFFERENCE_MM);
+        let turn = DIFFERENCE_MM / (self.scene.radius_mm + place.height);
+        let around = (self.height(place.angle + turn, place.z).0 - place.height) / DIFFERENCE_MM;
+        let beside = self.height_towards((place.angle, place.outward), place.z + DIFFERENCE_MM).0;
+        let along = (beside - place.height) / DIFFERENCE_MM;
         let [c, s] = place.outward;
         Vec3::new(c + around * s, s - around * c, -along).normalize()
     }
@@ -199,8 +199,9 @@ impl Surface {
         let ray = Ray { origin: *p, direction: *to_lamp };
         let up = ray.direction.x * place.outward[0] + ray.direction.y * place.outward[1];
         let aside = (1.0 - up * up).max(0.0).sqrt();
-        // A ray that climbs faster than the surface can is free.
-        if up > STEEPEST * aside && !self.steep {
+        // A ray that climbs faster than the surface can is free, but for what is steeper, where that can reach.
+        let climbs = up > STEEPEST * aside;
+        if climbs && !self.steep_near(place.z) {
             return false;
         }
         let Some((_, leave)) = ray.through(self.scene.radius_mm + self.top_mm) else { return false };
@@ -212,6 +213,9 @@ impl Surface {
             let above = self.place(&ray.at(t)).above;
             if above < 0.0 {
                 return true;
+            }
+            if climbs && above > self.steep_mm {
+                return false;
             }
             let closing = STEEPEST * aside - up;
             t += if closing > 0.0 { (above / closing).max(SHADOW_MM) } else { SHADOW_MM };

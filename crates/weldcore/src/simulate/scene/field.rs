@@ -94,6 +94,16 @@ fn noise(seed: u64, number: usize) -> f64 {
     f64::from(normals().draw(mix(seed ^ mix(number as u64))))
 }
 
+/// An angle of -π to 2π, as they come, from 0 to 2π: cheaper than a remainder.
+#[inline]
+fn turn(angle: f64) -> f64 {
+    match angle {
+        a if (0.0..TAU).contains(&a) => a,
+        a if (-TAU..0.0).contains(&a) => a + TAU,
+        a => a.rem_euclid(TAU),
+    }
+}
+
 /// How many nodes stand around the pipe for a correlation length.
 fn nodes_around(radius_mm: f64, length_mm: f64) -> usize {
     ((TAU * radius_mm * NODES_PER_LENGTH / length_mm).ceil() as usize).max(FEWEST)
@@ -143,7 +153,7 @@ impl Field {
 
     #[inline]
     pub(super) fn at(&self, angle: f64, z: f64) -> f64 {
-        let x = angle.rem_euclid(TAU) * self.per_rad;
+        let x = turn(angle) * self.per_rad;
         let y = ((z + self.half_length_mm) * self.per_mm).clamp(0.0, (self.along - 4) as f64);
         let (i, j) = (x as usize, (y as usize).min(self.along - 4));
         let (across, down) = (spline(x - i as f64), spline(y - j as f64));
@@ -184,7 +194,7 @@ impl Curve {
         if self.nodes.is_empty() {
             return 0.0;
         }
-        let x = angle.rem_euclid(TAU) * self.per_rad;
+        let x = turn(angle) * self.per_rad;
         let i = x as usize;
         let weights = spline(x - i as f64);
         let at = |m: usize| self.nodes.get((i + m) % self.nodes.len()).copied().unwrap_or(0.0);

@@ -253,8 +253,12 @@ pub struct Surface {
     drops: Vec<Vec<Spatter>>,
     top_mm: f64,
     bottom_mm: f64,
-    /// Rises somewhere more steeply than `cast::STEEPEST`.
-    steep: bool,
+    /// How high that stands which rises more steeply than `cast::STEEPEST`, mm: the toes of an elliptic cap, drops.
+    steep_mm: f64,
+    /// The toes lie between these, z, mm.
+    toes_within: [f64; 2],
+    /// Whether a wall's height depends on where its toe and the seam are.
+    from_toe: [bool; 2],
 }
 
 impl Surface {
@@ -284,7 +288,14 @@ impl Surface {
             }
         }
         let (top_mm, bottom_mm) = scene.bounds();
-        let steep = scene.cap.blend < 1.0 || scene.second.is_some() || !scene.spatter.is_empty();
+        let crest = scene.cap.height_mm.abs() + scene.cap.ripple_mm + BOUND_SIGMA * scene.cap.crest.sd_mm;
+        let drop = scene.spatter.iter().map(|d| 0.7 * d.radius_mm).fold(0.0, f64::max);
+        let steep_mm = drop.max(if scene.cap.blend < 1.0 { crest } else { 0.0 });
+        let reach = 0.5 * scene.cap.width_mm + BOUND_SIGMA * (scene.cap.toes.sd_mm + scene.seam_wander.sd_mm);
+        let from_toe = [&scene.reference, &scene.other].map(|w| {
+            let machined = w.taper.is_some() || w.counterbore.is_some() || w.flare.is_some();
+            machined || w.shrinkage_mm != 0.0 || !w.dents.is_empty() || !w.strips.is_empty() || scene.second.is_some()
+        });
         Ok(Self {
             toes: [curve(&scene.cap.toes, 1), curve(&scene.cap.toes, 2)],
             crest: curve(&scene.cap.crest, 3),
@@ -294,7 +305,9 @@ impl Surface {
             drops,
             top_mm,
             bottom_mm,
-            steep,
+            steep_mm,
+            toes_within: [scene.seam_mm - reach, scene.seam_mm + reach],
+            from_toe,
             scene,
         })
     }
@@ -302,6 +315,15 @@ impl Surface {
     /// The parameters.
     pub fn scene(&self) -> &Scene {
         &self.scene
+    }
+
+    /// Whether something steep can stand between a lamp and a place of this z.
+    #[inline]
+    fn steep_near(&self, z: f64) -> bool {
+        // Light comes in at 15 degrees over the surface at least: four times the height.
+        let [low, high] = self.toes_within.map(|toe| toe - self.scene.seam_mm);
+        let reach = low.abs().max(high) + 4.0 * self.steep_mm;
+        !self.scene.spatter.is_empty() || (self.steep_mm > 0.0 && (z - self.scene.seam_mm).abs() < reach)
     }
 
     /// The middle of the seam and z of both toes at an angle.
@@ -428,7 +450,13 @@ impl Surface {
     /// [`Self::height`] with the unit vector of the angle.
     #[inline]
     fn height_towards(&self, at: (f64, [f64; 2]), z: f64) -> (f64, Part) {
-        let (middle, toes) = self.toes(at.0);
+        // Away from the seam many a wall need not know where its toe is.
+        let [low, high] = self.toes_within;
+        let (middle, toes) = match (z < low, z > high) {
+            (true, _) if !self.from_toe[0] => (self.scene.seam_mm, self.toes_within),
+            (_, true) if !self.from_toe[1] => (self.scene.seam_mm, self.toes_within),
+            _ => self.toes(at.0),
+        };
         let on_wall = |side: Side, x: f64, part: Part| {
             let (more, on_second) = self.second(side, middle, z);
             let f = self.wall(side, at, z, x, (z - middle).abs()) + more;

@@ -27,6 +27,7 @@ __all__ = [
     "SphereFit",
     "WeakDirection",
     "WeldShot",
+    "WeldSurface",
     "WrappedPhase",
     "__version__",
     "calibrate_reference_plane",
@@ -266,6 +267,13 @@ def simulate_shot(
     seed: int = 0,
 ) -> SimulatedShot: ...
 def simulated_step(weld: Any, along: ArrayLike) -> NDArray[np.float64]: ...
+
+@final
+class WeldSurface:
+    def __new__(cls, weld: Any) -> WeldSurface: ...
+    def height(self, angle_rad: ArrayLike, z_mm: ArrayLike) -> NDArray[np.float64]: ...
+    def edges(self, angle_rad: ArrayLike) -> NDArray[np.float64]: ...
+    def cast(self, scanner: Scanner, weld_from_scanner: ArrayLike) -> dict[str, NDArray[Any]]: ...
 
 # fit
 @final

@@ -12,6 +12,7 @@
 //!
 //! Random numbers are a hash of seed, frame and pixel: the same bits in any order and on any number of threads.
 
+pub mod scene;
 mod shapes;
 mod weld;
 

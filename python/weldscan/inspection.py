@@ -301,7 +301,7 @@ class _Run:
                 why_not_measured=reason,
                 coverage_deg=coverage,
                 required_coverage_deg=self.required_deg,
-                bars=[*common, *([doubt] if (doubt := doubts[norm]) else [])],
+                bars=[*common, *(said for said in (doubts[norm],) if said is not None)],
             )
         ]
         timing = self.read.timing

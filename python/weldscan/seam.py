@@ -228,7 +228,7 @@ def seam_of(
     for view, (whole, near) in zip(views, tables, strict=True):
         findings += _of_fates(view.name, whole, near)
         findings += [
-            bar(code, f"{view.name}: {text} (at {angle:.0f}°)", view.name, angle)
+            bar(code, text, view.name, angle)
             for code, angle, text in view.shot.doubts
         ]
     return Seam(bins, coverage, tuple(findings))
@@ -269,7 +269,7 @@ def _of_fates(name: str, whole: NDArray[np.uint32], near: NDArray[np.uint32]) ->
         if (share > UNEXPLAINED_PART).any():
             k = int(np.argmax(share))
             text = (
-                f"{name}: {odd[k]} of {points[k]} points {where} at {BIN_DEG * k:.0f}° belong neither to a wall nor to the "
+                f"{odd[k]} of {points[k]} points {where} belong neither to a wall nor to the "
                 "cap: what are they?"
             )
             findings.append(bar("points-without-wall", text, name, BIN_DEG * k))
@@ -279,7 +279,7 @@ def _of_fates(name: str, whole: NDArray[np.uint32], near: NDArray[np.uint32]) ->
     if (saturated > SATURATED_PART).any():
         k = int(np.argmax(saturated))
         text = (
-            f"{name}: {100 * saturated[k]:.0f} % of the pixels at the weld at {BIN_DEG * k:.0f}° are saturated: what is left "
+            f"{100 * saturated[k]:.0f} % of the pixels at the weld are saturated: what is left "
             "is no sample of its surface; scan with a shorter exposure"
         )
         findings.append(bar("saturation", text, name, BIN_DEG * k))
@@ -288,6 +288,6 @@ def _of_fates(name: str, whole: NDArray[np.uint32], near: NDArray[np.uint32]) ->
     some = (near[:, POINTS].sum(axis=1) >= LEAST_PIXELS) & (lost > LOST_PART) & (saturated <= SATURATED_PART)
     if some.any():
         k = int(np.argmax(np.where(some, lost, 0.0)))
-        text = f"{name}: {100 * lost[k]:.0f} % of the pixels at the weld at {BIN_DEG * k:.0f}° were not measured"
+        text = f"{100 * lost[k]:.0f} % of the pixels at the weld were not measured"
         findings.append(bar("coverage", text, name, BIN_DEG * k))
     return findings

@@ -214,6 +214,32 @@ impl Model<'_> {
         self.arcs.len() * (CYLINDER + self.shapes()) + self.shells() + self.step_columns()
     }
 
+    /// The columns that are not zero in the rows of a shot.
+    fn columns_of_shot(&self, shot: usize) -> Vec<usize> {
+        let width = CYLINDER + self.shapes();
+        let common = self.arcs.len() * width;
+        let shapes = self.columns() - (self.arcs.len() - shot) * self.shapes();
+        let mut own: Vec<usize> = (shot * width..(shot + 1) * width).collect();
+        own.extend(common..self.columns() - self.arcs.len() * self.shapes());
+        own.extend(shapes..shapes + self.shapes());
+        own
+    }
+
+    /// The columns of a plainer model among those of this one, which has all terms.
+    fn columns_with(&self, terms: Terms) -> Vec<usize> {
+        let (shots, width, kept) = (self.arcs.len(), CYLINDER + self.shapes(), terms.shape - 2);
+        let mut columns: Vec<usize> = (0..shots).flat_map(|k| k * width..k * width + CYLINDER + kept).collect();
+        let shells = shots * width;
+        let step = shells + self.shells();
+        columns.extend((shells..step).filter(|_| terms.shell));
+        columns.extend(step..step + 2);
+        columns.extend((step + 2..step + 3).filter(|_| terms.radius));
+        columns.extend((step + 3..step + 5).filter(|_| terms.tilt));
+        let shapes = step + 5;
+        columns.extend((0..shots).flat_map(|k| shapes + k * self.shapes()..shapes + k * self.shapes() + kept));
+        columns
+    }
+
     /// The row of the reference wall's correction, into its columns of `row`.
     fn reference_row(&self, shot: usize, angle: f64, axial: f64, row: &mut [f64]) {
         let arc = &self.arcs[shot];
@@ -285,8 +311,6 @@ struct Solution {
     /// Covariance of the parameters.
     covariance: DMatrix<f64>,
     residuals: Vec<f64>,
-    /// Sum of the squared whitened residuals.
-    cost: f64,
 }
 
 /// Generalised least squares: rows and deviations are whitened first.
@@ -333,7 +357,7 @@ fn solve(model: &Model, cells: &[Cell], whitener: &Whitener) -> Result<Solution>
     }
     let scale = cost / (cells.len() - columns) as f64;
     let covariance = &inverse * inverse.transpose() * scale;
-    Ok(Solution { parameters, covariance, residuals: residuals.iter().copied().collect(), cost })
+    Ok(Solution { parameters, covariance, residuals: residuals.iter().copied().collect() })
 }
 
 /// `(e × n)² / 2R`: how far a cylinder that is off its axis falls short of `e·n`.
@@ -500,9 +524,15 @@ impl Whitener {
 
     /// `L⁻¹ x`, in place.
     fn apply(&self, x: &mut [f64]) {
-        for (i, (first, row)) in self.rows.iter().enumerate() {
+        self.apply_from(0, x);
+    }
+
+    /// The same for the cells from `start` on; a shot's depend on none before it.
+    fn apply_from(&self, start: usize, x: &mut [f64]) {
+        for i in 0..x.len() {
+            let (first, row) = &self.rows[start + i];
             let last = row.len() - 1;
-            let sum: f64 = row[..last].iter().zip(&x[*first..i]).map(|(a, b)| a * b).sum();
+            let sum: f64 = row[..last].iter().zip(&x[first - start..i]).map(|(a, b)| a * b).sum();
             x[i] = (x[i] - sum) / row[last];
         }
     }
@@ -739,12 +769,14 @@ pub fn measure(shots: &[Shot], known: &Known) -> Result<Step> {
 /// Adds groups of terms to the plain offset as long as Schwarz's criterion falls.
 fn choose<'a>(model: &impl Fn(Terms) -> Model<'a>, cells: &[Cell], whitener: &Whitener) -> Result<Terms> {
     let count = cells.len() as f64;
-    let criterion = |terms: Terms| -> Option<f64> {
-        let m = model(terms);
-        let s = solve(&m, cells, whitener).ok()?;
-        Some(count * (s.cost / count).max(f64::MIN_POSITIVE).ln() + m.columns() as f64 * count.ln())
-    };
     let mut terms = Terms { radius: false, tilt: false, shape: 2, shell: false };
+    let full = model(Terms { radius: true, tilt: true, shape: MAX_SHAPE_DEGREE, shell: true });
+    let normal = Normal::of(&full, cells, whitener, &solve(&model(terms), cells, whitener)?.residuals);
+    let criterion = |terms: Terms| -> Option<f64> {
+        let columns = full.columns_with(terms);
+        let cost = normal.cost(&columns)?;
+        Some(count * (cost / count).max(f64::MIN_POSITIVE).ln() + columns.len() as f64 * count.ln())
+    };
     let mut best = criterion(terms).unwrap_or(f64::INFINITY);
     loop {
         let mut candidates =
@@ -757,6 +789,58 @@ fn choose<'a>(model: &impl Fn(Terms) -> Model<'a>, cells: &[Cell], whitener: &Wh
             Some((value, next)) if value < best => (best, terms) = (value, next),
             _ => return Ok(terms),
         }
+    }
+}
+
+/// The normal equations of the fullest model for what the plainest one leaves: every model between them is a part of them,
+/// and costs next to nothing. The plainest one's residuals are small, so that no digits cancel.
+struct Normal {
+    matrix: DMatrix<f64>,
+    right: DVector<f64>,
+    square: f64,
+}
+
+impl Normal {
+    fn of(model: &Model, cells: &[Cell], whitener: &Whitener, residuals: &[f64]) -> Self {
+        let starts: Vec<usize> = (0..=model.arcs.len()).map(|k| cells.partition_point(|c| c.shot < k)).collect();
+        let shots: Vec<usize> = (0..model.arcs.len()).collect();
+        // The columns of another shot are zero in a shot's rows, and whitening stays within a shot.
+        let parts: Vec<(Vec<usize>, DMatrix<f64>, DVector<f64>, f64)> = threads::install(|| {
+            shots
+                .par_iter()
+                .map(|&k| {
+                    let (start, own) = (starts[k], model.columns_of_shot(k));
+                    let mut white = DMatrix::zeros(starts[k + 1] - start, own.len());
+                    let mut left = DVector::from_column_slice(&residuals[start..starts[k + 1]]);
+                    for (i, cell) in cells[start..starts[k + 1]].iter().enumerate() {
+                        let row = model.row(cell);
+                        own.iter().enumerate().for_each(|(j, &column)| white[(i, j)] = row[column]);
+                    }
+                    white.column_iter_mut().for_each(|mut c| whitener.apply_from(start, c.as_mut_slice()));
+                    whitener.apply_from(start, left.as_mut_slice());
+                    let square = left.norm_squared();
+                    (own, white.tr_mul(&white), white.tr_mul(&left), square)
+                })
+                .collect()
+        });
+        let n = model.columns();
+        let mut all = Self { matrix: DMatrix::zeros(n, n), right: DVector::zeros(n), square: 0.0 };
+        for (own, matrix, right, square) in parts {
+            all.square += square;
+            for (i, &a) in own.iter().enumerate() {
+                all.right[a] += right[i];
+                own.iter().enumerate().for_each(|(j, &b)| all.matrix[(a, b)] += matrix[(i, j)]);
+            }
+        }
+        all
+    }
+
+    /// What is left when these columns are fitted; `None` where they do not stand apart.
+    fn cost(&self, columns: &[usize]) -> Option<f64> {
+        let matrix = DMatrix::from_fn(columns.len(), columns.len(), |i, j| self.matrix[(columns[i], columns[j])]);
+        let right = DVector::from_fn(columns.len(), |i, _| self.right[columns[i]]);
+        let solution = matrix.cholesky()?.solve(&right);
+        Some((self.square - right.dot(&solution)).max(0.0)).filter(|c| c.is_finite())
     }
 }
 

@@ -49,9 +49,9 @@ WALL_LEAN_RAD = math.radians(0.1)
 # so many cells around and along, for the fit has flattened them.
 UNEVENNESS_MM, FLATTENED = 0.01, 2.0
 GRID = 10
-# How far a pipe's cut end may be from square (API 5L, 9.12.5.5), and how far the middle between two toes may be from
-# it in parts of the cap's width: a cap is as much wider on one side. A toe misread in one shot moves the middle
-# by half of what the widths differ; a cap so wide has a bar of its own.
+# How far a pipe's cut end may be from square (a sixteenth of an inch is the usual tolerance), and how far the middle
+# between two toes may be from it in parts of the cap's width: a cap is as much wider on one side. A toe misread in one
+# shot moves the middle by half of what the widths differ; a cap so wide has a bar of its own.
 SQUARENESS_MM = 1.6
 CAP_PART = 0.2
 # An out-of-roundness of 2 % of the diameter moves the centre of a local circle by up to 1.5 % of it, to either side.

@@ -27,9 +27,9 @@ from weldscan.session import PartSpec, Session, ShotSpec, frame_names, read_text
 
 Floats = NDArray[np.float64]
 
-# --- the diameter. A delivery tolerance is 1 % (EN 10217), an out-of-roundness of 2 % of the diameter (the amplitude of
+# --- the diameter. The usual delivery tolerance is 1 %; an out-of-roundness of 2 % of the diameter (the amplitude of
 # its second harmonic is 0.5 % of it) bends the wall locally by three times that: 1.5 % of the diameter, 3 % of the
-# radius. Beyond both the pipe is another one: neighbouring sizes of EN 10220 are 7 % apart and more.
+# radius. Beyond both together it is more likely another pipe: most neighbouring sizes are 7 % apart and more.
 DIAMETER_WARNING = 0.02
 DIAMETER_BAR = 0.05
 # Beyond this no wall is fitted to the nominal diameter (as in the core's segmentation): nothing of it is measured.
@@ -49,12 +49,11 @@ AXIS_BAR_DEG = 8.0
 UNDECIDED_DEG = 60.0
 # The mark is made square to the axis: this far from square, an axis that is 2 degrees off turns it by a degree more.
 ZERO_WARNING_DEG = 30.0
-# A girth weld is square to the pipe; a mitred one is inclined by half the bend's angle, 22.5 degrees at most (EN 10253
-# bends of 90 degrees are made of three cuts or more, 15 degrees).
+# A girth weld is square to the pipe; a mitred one is inclined by half of what the bend turns there, 45 degrees at most.
 SEAM_WARNING_DEG = 5.0
 SEAM_BAR_DEG = 22.5
 
-# --- the wall. Of the pipes of EN 10220 the thinnest have t/D = 1/403 (2540 x 6.3), the thickest 0.25 (25 x 6.3).
+# --- the wall. Pipes of plant have t/D of 1/400 (large, thin) to 1/4 (small, for high pressure).
 THIN_WARNING, THIN_BAR = 1 / 420, 1 / 600
 THICK_WARNING, THICK_BAR = 0.3, 0.4
 # Walls that are joined differ by a wall's own thickness; ten times is a slip of the decimal point.
@@ -229,7 +228,7 @@ def _differences(told: Any, meant: Any, path: str = "") -> Iterator[str]:
         for index, pair in enumerate(zip(told, meant, strict=True)):
             yield from _differences(*pair, f"{path}.{index}")
     elif isinstance(told, float | int) and isinstance(meant, float | int) and type(told) is not bool:
-        if abs(told - meant) > RECORD_TOLERANCE * min(1.0, abs(meant)):
+        if abs(told - meant) > max(RECORD_TOLERANCE * min(1.0, abs(meant)), 1e-9):
             yield f"{path} is {told:g}, recorded {meant:g}"
     elif told != meant:
         yield f"{path} is {_short(told)}, recorded {_short(meant)}"

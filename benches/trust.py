@@ -147,12 +147,18 @@ def _table(rows: list[dict], kinds: list[str]) -> str:
         totals[group][1] += len(honest)
         share = f"{kept} of {len(honest)}" if honest else ""
         cells = [said[v] for v in ("FAIL", "INCONCLUSIVE", "NOT MEASURED")]
-        out.append(f"| {kind} | {group} | {len(mine)} | {len(over)} | {wrong} | {' | '.join(map(str, cells))} | {share} |")
+        out.append(
+            f"| {kind} | {group} | {len(mine)} | {len(over)} | {wrong} | {' | '.join(map(str, cells))} | {share} |"
+        )
     for group, (lost, of) in totals.items():
         if of:
-            out.append(f"\nHonest scenes of the {group} kinds that lose their verdict: {lost} of {of} ({100 * lost / of:.1f} %).")
+            out.append(
+                f"\nHonest scenes of the {group} kinds that lose their verdict: {lost} of {of} ({100 * lost / of:.1f} %)."
+            )
     over = [row for row in rows if row.get("over")]
-    out.append(f"\nTrue step above the limit: {len(over)} runs, wrong PASS {sum(r['verdict'] == 'PASS' for r in over)}.")
+    out.append(
+        f"\nTrue step above the limit: {len(over)} runs, wrong PASS {sum(r['verdict'] == 'PASS' for r in over)}."
+    )
     return "\n".join(out)
 
 

@@ -476,8 +476,11 @@ def _step_result(step: dict[str, Any], edges: EdgeProfile, part: PartSpec) -> St
         budget = tuple(BudgetLine(name, float(column(key)[worst]), derived) for key, name, derived in BUDGET)
         # The walls' own largest upper bound may stand in another bin than their largest step.
         upper = max(value + u, float((np.abs(wall) + wall_u).max()))
-        if edges.judged is not None and edges.worst is not None and sum(edges.judged) > upper and (
-            edges.confirmed_mm > upper or edges.contradict(bins, wall, wall_u)
+        if (
+            edges.judged is not None
+            and edges.worst is not None
+            and sum(edges.judged) > upper
+            and (edges.confirmed_mm > upper or edges.contradict(bins, wall, wall_u))
         ):
             (value, u), at, judged = edges.judged, BIN_DEG * edges.worst, "edge"
             derived = "reading beside both toes: noise, choice of the stretch, and what the choice of the toes may hide"

@@ -60,10 +60,10 @@ class EdgeProfile:
         value, u = abs(float(self.step_mm[self.worst])), float(self.u_mm[self.worst])
         return value, max(u, value - max(self.confirmed_mm, 0.0))
 
-
     def contradict(self, bins: NDArray[np.intp], wall_mm: Floats, wall_u_mm: Floats) -> bool:
         """Whether the edges tell another step than the walls: beyond what both leave open (k = 3 of their joint
-        uncertainty, the hull once) in two bins beside each other."""
+        uncertainty, the hull once) in two bins beside each other.
+        """
         off = np.abs(self.step_mm[bins] - wall_mm) - (CONTRADICTION * np.hypot(self.u_mm[bins], wall_u_mm))
         beyond = set(bins[off > 0].tolist())
         return any((k + 1) % BINS in beyond for k in beyond)
@@ -113,7 +113,8 @@ def _stations_by_bin(view: PartView) -> dict[int, NDArray[np.intp]]:
 
 def expected_bins(views: Sequence[PartView], scanner: Scanner) -> set[int]:
     """The bins that these views should have seen, by poses, lenses and the pipe: whole, with the walls beside the weld,
-    in both images, and not too steep to either ray."""
+    in both images, and not too steep to either ray.
+    """
     expected: set[int] = set()
     projector = np.asarray(scanner.camera_from_projector)[:3, 3]
     for view in views:
@@ -227,10 +228,7 @@ def seam_of(
     findings = [*_of_coverage(coverage)]
     for view, (whole, near) in zip(views, tables, strict=True):
         findings += _of_fates(view.name, whole, near)
-        findings += [
-            bar(code, text, view.name, angle)
-            for code, angle, text in view.shot.doubts
-        ]
+        findings += [bar(code, text, view.name, angle) for code, angle, text in view.shot.doubts]
     return Seam(bins, coverage, tuple(findings))
 
 
@@ -268,10 +266,7 @@ def _of_fates(name: str, whole: NDArray[np.uint32], near: NDArray[np.uint32]) ->
         share = np.where(points >= LEAST_PIXELS, odd / np.maximum(points, 1), 0.0)
         if (share > UNEXPLAINED_PART).any():
             k = int(np.argmax(share))
-            text = (
-                f"{odd[k]} of {points[k]} points {where} belong neither to a wall nor to the "
-                "cap: what are they?"
-            )
+            text = f"{odd[k]} of {points[k]} points {where} belong neither to a wall nor to the cap: what are they?"
             findings.append(bar("points-without-wall", text, name, BIN_DEG * k))
             break
     total = near.sum(axis=1)

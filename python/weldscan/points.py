@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from weldscan._weldcore import Cloud, PhaseMap, Scanner, decode, triangulate
+from weldscan._weldcore import Cloud, Disagreement, PhaseMap, Scanner, decode, triangulate
 from weldscan.errors import InputError
 from weldscan.session import FringeSet, Session, ShotSpec, read_frames
 
@@ -31,6 +31,9 @@ class PointReader:
         masks: per shot, how many pixels were measured, and how many not for which reason.
         warnings: what a reader of the result should know.
         phase_errors: per shot, what was taken off the phase of each fringe set for the projector's response.
+        disagreements: per shot, where its frames contradict each other, with the likely cause; empty lists where they agree.
+            Their `frames` count in the stack of `axis`; `frames` of this reader maps them to the shot's images.
+        clipped: per shot the level at which the camera clips below the full scale of its numbers, where it does.
     """
 
     def __init__(self, session: Session, progress: Progress | None = None, compensate: Compensate = "auto") -> None:
@@ -41,6 +44,8 @@ class PointReader:
         self.masks: dict[str, dict[str, int]] = {}
         self.warnings: list[str] = []
         self.phase_errors: dict[str, list[dict[str, Any]]] = {}
+        self.disagreements: dict[str, list[Disagreement]] = {}
+        self.clipped: dict[str, float] = {}
 
     def __call__(self, shot: ShotSpec) -> Cloud:
         """The shot's points, scanner frame, on the camera's pixel grid."""
@@ -57,7 +62,7 @@ class PointReader:
         elif callable(self.compensate):
             wanted = [self.compensate(f) for f in self.fringes]
         try:
-            phase = decode(exposures, [(f.periods, f.steps) for f in self.fringes], size, phase_error=wanted)
+            phase = decode(exposures, [f.code for f in self.fringes], size, phase_error=wanted)
         except InputError as error:
             # The images were checked when they were read: what is left are the fringe sets.
             raise InputError(f"{self.session.folder / 'session.json'}: fringes: {error}") from None
@@ -75,6 +80,9 @@ class PointReader:
 
     def _note(self, shot: ShotSpec, phase: PhaseMap) -> None:
         self.masks[shot.name] = dict(zip(MASKS, map(int, phase.counts), strict=True))
+        self.disagreements[shot.name] = list(phase.disagreements)
+        if phase.clipped_below_full_scale:
+            self.clipped[shot.name] = phase.saturation
         worst = max((h for h in phase.harmonics if h is not None), default=0.0)
         if worst > HARMONIC_WARNING and phase.counts[0] > 0 and self.compensate == "off":
             self.warnings.append(

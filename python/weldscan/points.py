@@ -31,7 +31,7 @@ class PointReader:
         masks: per shot, how many pixels were measured, and how many not for which reason.
         warnings: what a reader of the result should know.
         phase_errors: per shot, what was taken off the phase of each fringe set for the projector's response.
-        disagreements: per shot, where its frames contradict each other, with the likely cause; empty lists where they agree.
+        disagreements: per shot, where its frames contradict each other, with the likely cause; empty where they agree.
             Their `frames` count in the stack of `axis`; `frames` of this reader maps them to the shot's images.
         clipped: per shot the level at which the camera clips below the full scale of its numbers, where it does.
     """

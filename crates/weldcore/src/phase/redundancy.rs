@@ -9,6 +9,8 @@
 //! What honest stacks do is taken off first: harmonics of the projector are one function of the phase, the same in every
 //! frame of a set; light that flickers scales a frame; the noise is known; dark, saturated and even pixels are left out.
 
+use std::f64::consts::TAU;
+
 use rayon::prelude::*;
 
 use super::noise::sample_rows;
@@ -20,7 +22,7 @@ use crate::unwrap::Plan;
 
 /// Pixels in a run, and how many runs a row is looked at in: memory comes in lines of so many pixels.
 const RUN: usize = 8;
-const RUNS_PER_ROW: usize = 10;
+const RUNS_PER_ROW: usize = 8;
 /// Half the swing of a set's frames over the noise, from which a pixel speaks: its phase then has 0.07 rad at most.
 const CLEAR: f32 = 10.0;
 /// Noise of a decision on the fringe order, in fringes, up to which a pixel speaks of it.
@@ -43,8 +45,11 @@ const EXPLAINED: f64 = 0.3;
 const LEFT: f64 = 2.0 * ORDERLY;
 /// Causes that explain as well as each other within this: the simplest is named.
 const AS_GOOD: f64 = 1.25;
-/// Mean agreement below which the sets have nothing to do with each other.
-const UNRELATED: f64 = 0.35;
+/// Random phases miss by more than a quarter of a fringe in half of the pixels, and to all sides: an uncorrected gamma with
+/// three steps misses by as much at most, and mostly to one side.
+const RANDOM_MISS: f64 = 0.25;
+const UNRELATED: f64 = 0.4;
+const AGREEMENT: f64 = 0.35;
 /// Displacements that are looked for, px, and from where on one is a jolt: a camera that trembles by 3 px all the while
 /// moves its mean by less than 4.
 const REACH: i64 = 12;
@@ -96,7 +101,7 @@ impl Sample {
     /// The variance of the set's phase there, turns², by its swing.
     fn phase_variance(&self, set: usize, steps: usize, i: usize) -> f64 {
         let b = f64::from(self.swing[set][i]).max(1e-6);
-        2.0 / steps as f64 * f64::from(self.variance[i]) / (b * b) / std::f64::consts::TAU.powi(2)
+        2.0 / steps as f64 * f64::from(self.variance[i]) / (b * b) / TAU.powi(2)
     }
 
     fn keep(&self, wanted: impl Fn(usize) -> bool) -> Self {
@@ -174,6 +179,8 @@ struct Order {
     cost: Vec<f32>,
     /// The mean residual of all sets, as a share of the fringes' power.
     residual: f64,
+    /// Whether some set has nothing to do with the one before.
+    unrelated: bool,
 }
 
 struct Court<'a> {
@@ -227,7 +234,8 @@ impl<'a> Court<'a> {
 
     fn hear_once(&self, sample: &Sample, reading: &Reading, errors: &[PhaseError]) -> Order {
         let n = sample.len();
-        let mut out = Order { disorder: 0.0, agreement: Vec::new(), cost: vec![0.0; n], residual: 0.0 };
+        let mut out =
+            Order { disorder: 0.0, agreement: Vec::new(), cost: vec![0.0; n], residual: 0.0, unrelated: false };
         let mut phases: Vec<Vec<f32>> = Vec::new();
         for (s, set) in self.sets.iter().enumerate() {
             let frames: Vec<&[f32]> =
@@ -250,24 +258,32 @@ impl<'a> Court<'a> {
         }
         let misses = self.misses(&phases, n);
         for (gains, misses) in self.decisions.iter().zip(misses) {
-            let quiet = |i: &usize| {
-                let used = gains.iter().enumerate().filter(|(_, g)| **g != 0.0);
-                let variance: f64 =
-                    used.clone().map(|(s, g)| g * g * sample.phase_variance(s, self.sets[s].steps, *i)).sum();
-                variance < QUIET_MISS * QUIET_MISS && used.clone().all(|(s, _)| sample.clear(s, *i))
+            let used: Vec<(usize, f64)> = gains.iter().copied().enumerate().filter(|(_, g)| *g != 0.0).collect();
+            // Of the miss, by noise; turns².
+            let variance = |i: usize| -> f64 {
+                used.iter().map(|&(s, g)| g * g * sample.phase_variance(s, self.sets[s].steps, i)).sum()
             };
-            let heard: Vec<usize> = (0..n).filter(quiet).collect();
+            let quiet = |i: usize| {
+                let variance = variance(i);
+                let clear = used.iter().all(|&(s, _)| sample.clear(s, i));
+                (clear && variance < QUIET_MISS * QUIET_MISS).then_some((i, variance))
+            };
+            let heard: Vec<(usize, f64)> = (0..n).filter_map(quiet).collect();
             if heard.len() < FEWEST {
                 out.agreement.push(None);
                 continue;
             }
             let mut sum = [0.0f64; 2];
-            for &i in &heard {
-                let (sin, cos) = (std::f64::consts::TAU * misses[i]).sin_cos();
+            let mut random = 0;
+            for &(i, variance) in &heard {
+                let (sin, cos) = (TAU * misses[i]).sin_cos();
                 sum = [sum[0] + cos, sum[1] + sin];
-                out.cost[i] += 1.0 - cos as f32;
+                random += usize::from(misses[i].abs() > RANDOM_MISS);
+                // Noise alone makes the mean of the cosine smaller by this factor.
+                out.cost[i] += ((-0.5 * TAU * TAU * variance).exp() - cos) as f32;
             }
             let mean = sum.map(|v| v / heard.len() as f64);
+            out.unrelated |= random as f64 > UNRELATED * heard.len() as f64 && mean[0].hypot(mean[1]) < AGREEMENT;
             out.agreement.push(Some(mean));
         }
         let mut costs = out.cost.clone();
@@ -450,7 +466,7 @@ fn origins(court: &Court<'_>, stated: &Order, falls: bool) -> Vec<Cause> {
         if gain.abs() < 0.5 || !origins.is_empty() {
             continue;
         }
-        let miss = im.atan2(re) / std::f64::consts::TAU;
+        let miss = im.atan2(re) / TAU;
         let whole = gain.abs().ceil() as i64;
         origins.extend((-whole..=whole).map(|k| (miss + k as f64) / gain).filter(|o| o.abs() <= 0.5 + 1e-9));
     }
@@ -460,7 +476,7 @@ fn origins(court: &Court<'_>, stated: &Order, falls: bool) -> Vec<Cause> {
     for o in origins {
         let before = court.sets.first().map_or((1.0, 0.0), |s| (s.direction, s.origin_rad));
         let one = court.sets.iter().all(|s| (s.direction, s.origin_rad) == before);
-        let added = o * std::f64::consts::TAU;
+        let added = o * TAU;
         let text = match (falls, one) {
             (true, true) => format!(
                 "the steps run the other way and start elsewhere: fringes[].direction = {}, origin_rad = {:.3}",
@@ -491,9 +507,9 @@ fn origins(court: &Court<'_>, stated: &Order, falls: bool) -> Vec<Cause> {
 
 /// An angle in (-π, π].
 fn principal(angle_rad: f64) -> f64 {
-    let turns = angle_rad / std::f64::consts::TAU;
+    let turns = angle_rad / TAU;
     let inside = turns - turns.round();
-    std::f64::consts::TAU * if inside <= -0.5 + 1e-9 { inside + 1.0 } else { inside }
+    TAU * if inside <= -0.5 + 1e-9 { inside + 1.0 } else { inside }
 }
 
 /// Frames that show the same. Exactly, for a file that was copied; but for noise and the lamp, for a pattern that was
@@ -707,9 +723,8 @@ fn explain<T: Level>(
     if let Some((left, cause)) = found {
         return told(cause.set, cause.frames, cause.text, left);
     }
-    let apart = stated.agreement.iter().flatten().any(|[re, im]| re.hypot(*im) < UNRELATED);
     // Each set a good one by itself: a picture that trembles spoils all of them.
-    if apart && stated.disorder > 1.0 - UNRELATED && stated.residual < ORDERLY {
+    if stated.unrelated && stated.residual < ORDERLY {
         let text = "the sets have nothing to do with each other: frames of another order, periods or scene".into();
         return told(None, (0..frames.len()).collect(), text, stated.disorder);
     }

@@ -278,7 +278,7 @@ fn validate<T>(shot: &Shot<'_, T>, sets: &[FringeSet], projector_size: usize, op
         let (expected, value) = ("1 or -1".into(), set.direction.to_string());
         return Err(Error::OutOfRange { what: "direction of a fringe set", expected, value });
     }
-    if let Some(set) = sets.iter().find(|s| !(s.origin_rad.abs() <= std::f64::consts::TAU)) {
+    if let Some(set) = sets.iter().find(|s| !s.origin_rad.is_finite() || s.origin_rad.abs() > std::f64::consts::TAU) {
         let (expected, value) = ("within one turn".into(), set.origin_rad.to_string());
         return Err(Error::OutOfRange { what: "origin_rad of a fringe set", expected, value });
     }

@@ -22,7 +22,7 @@ use crate::unwrap::Plan;
 
 /// Pixels in a run, and how many runs a row is looked at in: memory comes in lines of so many pixels.
 const RUN: usize = 8;
-const RUNS_PER_ROW: usize = 8;
+const RUNS_PER_ROW: usize = 6;
 /// Half the swing of a set's frames over the noise, from which a pixel speaks: its phase then has 0.07 rad at most.
 const CLEAR: f32 = 10.0;
 /// Noise of a decision on the fringe order, in fringes, up to which a pixel speaks of it.
@@ -33,6 +33,8 @@ const FEWEST: usize = 150;
 const PARTS: usize = 24;
 /// A frame may be brighter or darker by this for the lamp's sake: flicker is a few per cent.
 const FLICKER: f32 = 0.06;
+/// The mean level over the amplitude, with some light from elsewhere.
+const MEAN_TO_SWING: f64 = 1.25;
 /// Edges, glints and light between walls spoil some pixels of any honest shot: the worst quarter is not heard.
 const HEARD: f64 = 0.75;
 /// Disorder up to which nothing is looked for: 1 - cos of 16 degrees of disagreement between sets, or a residual of
@@ -466,7 +468,12 @@ fn origins(court: &Court<'_>, stated: &Order, falls: bool) -> Vec<Cause> {
         if gain.abs() < 0.5 || !origins.is_empty() {
             continue;
         }
+        // The lamp's flicker turns a phase by ε A/B √(2/N), the same in all pixels of a brightness.
+        let lamp: f64 = gains.iter().zip(court.sets).map(|(g, s)| g * g * 2.0 / s.steps as f64).sum();
         let miss = im.atan2(re) / TAU;
+        if TAU * miss.abs() < f64::from(FLICKER) * MEAN_TO_SWING * lamp.sqrt() {
+            continue;
+        }
         let whole = gain.abs().ceil() as i64;
         origins.extend((-whole..=whole).map(|k| (miss + k as f64) / gain).filter(|o| o.abs() <= 0.5 + 1e-9));
     }
@@ -723,8 +730,8 @@ fn explain<T: Level>(
     if let Some((left, cause)) = found {
         return told(cause.set, cause.frames, cause.text, left);
     }
-    // Each set a good one by itself: a picture that trembles spoils all of them.
-    if stated.unrelated && stated.residual < ORDERLY {
+    // Each set a good one by itself, which three steps do not show: a picture that trembles spoils all of them.
+    if court.sets.iter().all(|s| s.steps > 3) && stated.unrelated && stated.residual < ORDERLY {
         let text = "the sets have nothing to do with each other: frames of another order, periods or scene".into();
         return told(None, (0..frames.len()).collect(), text, stated.disorder);
     }
@@ -748,21 +755,28 @@ pub(super) fn run_over(
     plan: &Plan,
     size: f64,
 ) -> Option<Disagreement> {
+    let line = |y: usize| columns.get(y * width..(y + 1) * width).unwrap_or_default();
+    let far = |(a, b): (&f64, &f64)| usize::from((a - b).abs() > WHOLE * size);
+    let found: usize = sample_rows(height)
+        .map(|row| {
+            let (here, below) = (line(row), line(row + NEIGHBOURS));
+            let across = here.iter().zip(here.iter().skip(NEIGHBOURS)).map(far).sum::<usize>();
+            across + here.iter().zip(below).map(far).sum::<usize>()
+        })
+        .sum();
+    if found < FEWEST_PAIRS {
+        return None;
+    }
     let mut pairs: Vec<[f64; 2]> = Vec::new();
     for row in sample_rows(height) {
-        let line = |y: usize| columns.get(y * width..(y + 1) * width).unwrap_or_default();
         let (here, below) = (line(row), line(row + NEIGHBOURS));
-        let across = here.iter().zip(here.iter().skip(NEIGHBOURS));
-        pairs.extend(across.chain(here.iter().zip(below)).map(|(a, b)| [*a, *b]).filter(|[a, b]| (a - b).is_finite()));
+        let both = here.iter().zip(here.iter().skip(NEIGHBOURS)).chain(here.iter().zip(below));
+        pairs.extend(both.map(|(a, b)| [*a, *b]).filter(|[a, b]| (a - b).is_finite()));
     }
     let jumps = |off: f64| {
         let at = |c: f64| (c + 0.5 + off).rem_euclid(size);
         pairs.iter().filter(|[a, b]| (at(*a) - at(*b)).abs() > WHOLE * size).count()
     };
-    let found = jumps(0.0);
-    if found < FEWEST_PAIRS {
-        return None;
-    }
     let starts = starts(sets);
     let base = plan.base.weights.iter().position(|w| *w != 0.0).filter(|_| plan.base.periods == 1.0);
     let base = base.filter(|_| plan.base.weights.iter().filter(|w| **w != 0.0).count() == 1);

@@ -14,7 +14,7 @@ use super::wave::Level;
 use crate::threads;
 
 /// Every so many of the rows at which the noise is taken.
-const EVERY: usize = 3;
+const EVERY: usize = 4;
 /// Full scale is cut into so many bins, 8 bits into their levels.
 const BINS: u32 = 1024;
 /// A pile-up may be this wide, bins: noise of two levels of 8 bits behind the clipping.

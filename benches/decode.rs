@@ -13,8 +13,7 @@ static ALLOCATOR: weldcore::memory::Recycler = weldcore::memory::Recycler;
 
 const WIDTH: usize = 1280;
 const HEIGHT: usize = 960;
-const SETS: [FringeSet; 3] =
-    [FringeSet { periods: 1.0, steps: 4 }, FringeSet { periods: 8.0, steps: 4 }, FringeSet { periods: 64.0, steps: 4 }];
+const SETS: [FringeSet; 3] = [FringeSet::new(1.0, 4), FringeSet::new(8.0, 4), FringeSet::new(64.0, 4)];
 
 /// The column that lights a pixel: a slanted wall.
 fn column(i: usize) -> f64 {

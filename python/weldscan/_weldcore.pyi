@@ -95,6 +95,21 @@ class Scanner:
 
 # phase
 @final
+class Disagreement:
+    @property
+    def exposure(self) -> int: ...
+    @property
+    def set(self) -> int | None: ...
+    @property
+    def frames(self) -> list[int]: ...
+    @property
+    def text(self) -> str: ...
+    @property
+    def share(self) -> float: ...
+    @property
+    def strength(self) -> float: ...
+
+@final
 class PhaseMap:
     @property
     def column_px(self) -> NDArray[np.float64]: ...
@@ -117,6 +132,10 @@ class PhaseMap:
     @property
     def saturation(self) -> float: ...
     @property
+    def clipped_below_full_scale(self) -> bool: ...
+    @property
+    def disagreements(self) -> list[Disagreement]: ...
+    @property
     def harmonics(self) -> list[float | None]: ...
     @property
     def phase_error(self) -> list[PhaseError]: ...
@@ -125,13 +144,14 @@ class PhaseMap:
 
 def decode(
     exposures: Sequence[Sequence[NDArray[Any]] | NDArray[Any]] | NDArray[Any],
-    fringes: Sequence[tuple[float, int]],
+    fringes: Sequence[tuple[float, int] | tuple[float, int, float, float]],
     projector_size: int,
     *,
     saturation: float | None = None,
     z: float = 5.0,
     phase_error: Literal["auto"] | Sequence[Sequence[float] | None] | None = None,
 ) -> PhaseMap: ...
+def saturation_level(images: Sequence[NDArray[Any]] | NDArray[Any]) -> tuple[float, float, bool]: ...
 
 # response
 @final
@@ -260,7 +280,7 @@ def simulate_shot(
     scanner: Scanner,
     scene_from_scanner: ArrayLike,
     bodies: Sequence[Any],
-    fringes: Sequence[tuple[str, float, int]],
+    fringes: Sequence[tuple[str, float, int] | tuple[str, float, int, float, float]],
     photometry: Any,
     *,
     exposures: Sequence[float] = ...,

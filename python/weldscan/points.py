@@ -11,9 +11,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import PhaseMap, Scanner, decode, triangulate
+from weldscan._weldcore import Disagreement, PhaseMap, Scanner, decode, triangulate
 from weldscan.errors import InputError
-from weldscan.result import Finding, warning
+from weldscan.result import Finding, bar, warning
 from weldscan.session import FringeSet, Image, Session, ShotSpec, read_frames
 
 Progress = Callable[[int, int, str], None]
@@ -50,6 +50,9 @@ class PointReader:
         findings: what a reader of the result should know.
         phase_errors: per shot, what was taken off the phase of each fringe set for the projector's response.
         digests: per shot, the hash of its images.
+        disagreements: per shot, where its frames contradict each other, with the likely cause; empty where they agree.
+            Their `frames` count in the stack of `axis`; `frames` of this reader maps them to the shot's images.
+        clipped: per shot the level at which the camera clips below the full scale of its numbers, where it does.
     """
 
     def __init__(self, session: Session, progress: Progress | None = None, compensate: Compensate = "auto") -> None:
@@ -61,6 +64,8 @@ class PointReader:
         self.findings: list[Finding] = []
         self.phase_errors: dict[str, list[dict[str, Any]]] = {}
         self.digests: dict[str, str] = {}
+        self.disagreements: dict[str, list[Disagreement]] = {}
+        self.clipped: dict[str, float] = {}
 
     def __call__(self, shot: ShotSpec) -> Scan:
         """The shot's points, scanner frame, on the camera's pixel grid."""
@@ -77,7 +82,7 @@ class PointReader:
         elif callable(self.compensate):
             wanted = [self.compensate(f) for f in self.fringes]
         try:
-            phase = decode(exposures, [(f.periods, f.steps) for f in self.fringes], size, phase_error=wanted)
+            phase = decode(exposures, [f.code for f in self.fringes], size, phase_error=wanted)
         except InputError as error:
             # The images were checked when they were read: what is left are the fringe sets.
             raise InputError(f"{self.session.folder / 'session.json'}: fringes: {error}") from None
@@ -96,6 +101,12 @@ class PointReader:
 
     def _note(self, shot: ShotSpec, phase: PhaseMap) -> None:
         self.masks[shot.name] = dict(zip(MASKS, map(int, phase.counts), strict=True))
+        self.disagreements[shot.name] = list(phase.disagreements)
+        self.findings += [bar("frames-disagree", each.text, shot.name) for each in phase.disagreements]
+        if phase.clipped_below_full_scale:
+            self.clipped[shot.name] = phase.saturation
+            text = f"the camera clips at {phase.saturation:g}, below its full scale; clipped pixels were left out"
+            self.findings.append(warning("clipped", f"{shot.name}: {text}", shot.name))
         worst = max((h for h in phase.harmonics if h is not None), default=0.0)
         if worst > HARMONIC_WARNING and phase.counts[0] > 0 and self.compensate == "off":
             self.findings.append(

@@ -24,7 +24,17 @@ from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from weldscan._weldcore import Lens, Scanner, decode_png
 from weldscan.errors import InputError
@@ -199,11 +209,34 @@ class ScannerSpec(_Model):
 
 
 class FringeSet(_Model):
-    """`steps` images of one frequency; column u of step i: 0.5 + 0.5 cos(2 pi (periods (u + 0.5)/width - i/steps))."""
+    """`steps` images of one frequency.
+
+    Column u of step i: 0.5 + 0.5 cos(2 pi (periods (u + 0.5)/width - direction i/steps) + origin_rad).
+    """
 
     axis: Literal["x", "y"]
     periods: Positive
     steps: Annotated[int, Field(ge=3, le=1000)]
+    direction: Literal[1, -1] = 1
+    """-1 where the fringes move the other way from step to step."""
+    origin_rad: Annotated[float, Field(ge=-2 * math.pi, le=2 * math.pi)] = 0.0
+    """The pattern's phase at the projector's border in step 0."""
+
+    @property
+    def pattern(self) -> tuple[str, float, int, int, float]:
+        """As `fringe_patterns` takes it."""
+        return self.axis, self.periods, self.steps, self.direction, self.origin_rad
+
+    @property
+    def code(self) -> tuple[float, int, int, float]:
+        """As `decode` takes it."""
+        return self.periods, self.steps, self.direction, self.origin_rad
+
+    @model_serializer(mode="wrap")
+    def _without_the_usual(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Files say a convention only where it is not the usual one."""
+        usual = {"direction": 1, "origin_rad": 0.0}
+        return {name: value for name, value in handler(self).items() if name not in usual or value != usual[name]}
 
 
 class ArtefactSpec(_Model):

@@ -993,6 +993,7 @@ mod tests {
             labels: &s.labels,
             radius_mm: s.frame.radius_mm,
             bead_width_mm: s.bead_width_mm,
+            thickness_mm: s.thickness_mm,
         }
     }
 

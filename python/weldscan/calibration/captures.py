@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from weldscan._weldcore import PhaseMap, decode
+from weldscan._weldcore import PhaseMap, decode, saturation_level
 from weldscan.calibration.board import Board, Seen
 from weldscan.errors import InputError
 from weldscan.session import FringeSet, Image, Pixels, PlainName, Positive, explain, read_image, read_text
@@ -229,7 +229,7 @@ def decode_stack(
         for fringe in fringes:
             frames += range(at, at + fringe.steps) if fringe.axis == axis else ()
             at += fringe.steps
-        sets = [(fringe.periods, fringe.steps) for fringe in fringes if fringe.axis == axis]
+        sets = [fringe.code for fringe in fringes if fringe.axis == axis]
         try:
             maps.append(decode([[row[i] for i in frames] for row in exposures], sets, side, phase_error="auto"))
         except InputError as error:
@@ -241,7 +241,7 @@ def decode_stack(
 def _white(exposures: Sequence[Sequence[Image]]) -> NDArray[np.uint8]:
     """The mean of a stack is the board evenly lit: the fringes cancel. Of several, the brightest not clipped."""
     means = [np.mean(np.asarray(row, dtype=np.float32), axis=0) for row in exposures]
-    top = np.iinfo(exposures[0][0].dtype).max
+    top = saturation_level([image for row in exposures for image in row])[0]
     # Full swing between black and white is a mean of half of it.
     whole = [mean for mean in means if np.mean(mean > 0.55 * top) < 0.01] or [min(means, key=lambda m: float(m.mean()))]
     mean = max(whole, key=lambda m: float(m.mean()))

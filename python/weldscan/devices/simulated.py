@@ -288,7 +288,11 @@ class Cell:
     seed: int = 1
     scanner: Scanner = field(default_factory=make_scanner)
     photometry: Photometry = field(default_factory=Photometry)
-    fringes: tuple[tuple[str, float, int], ...] = (("x", 1, 4), ("x", 8, 4), ("x", 64, 4))
+    fringes: tuple[tuple[str, float, int] | tuple[str, float, int, int, float], ...] = (
+        ("x", 1, 4),
+        ("x", 8, 4),
+        ("x", 64, 4),
+    )
     """Sets of (axis, periods, steps)."""
     distance_mm: float = 420.0
 
@@ -402,7 +406,7 @@ DEFAULT = Cell()
 class BoardCell(Cell):
     """A cell for calibrating its scanner: a chessboard lies where the three-sphere plate was, fringes run both ways."""
 
-    fringes: tuple[tuple[str, float, int], ...] = board_fringes(1280, 800)
+    fringes: tuple[tuple[str, float, int] | tuple[str, float, int, int, float], ...] = board_fringes(1280, 800)
     corners: tuple[int, int] = (8, 11)
     square_mm: float = 8.0
 
@@ -486,7 +490,10 @@ def _document(cell: Cell, shots: Sequence[_Shot], random: np.random.Generator) -
             "projector": _lens(cell.scanner.projector),
             "camera_from_projector": cell.scanner.camera_from_projector.tolist(),
         },
-        "fringes": [{"axis": axis, "periods": periods, "steps": steps} for axis, periods, steps in cell.fringes],
+        "fringes": [
+            dict(zip(("axis", "periods", "steps", "direction", "origin_rad"), fringe, strict=False))
+            for fringe in cell.fringes
+        ],
         "part": {
             "kind": "pipe",
             "outside_diameter": cell.stated_diameter_mm or 2 * cell.weld.reference.radius_mm,

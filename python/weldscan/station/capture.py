@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from weldscan._weldcore import saturation_level
 from weldscan.devices.camera import Camera, Image
 from weldscan.devices.projector import Pattern, Projector, whole_refreshes
 
@@ -54,9 +55,13 @@ def capture_stack(
     return images
 
 
-def full_scale(image: Image) -> int:
-    """Return the largest value that this kind of image can have."""
-    return int(np.iinfo(image.dtype).max)
+def full_scale(images: Sequence[Image]) -> int:
+    """Return the largest value that the camera can give, by its images: cameras of 10 and 12 bits fill words of 16.
+
+    That is the full scale of the narrowest of 8, 10, 12, 14 and 16 bits that holds the largest value of any image. A
+    dark image says too little, so judge it together with a bright one.
+    """
+    return int(saturation_level(images)[1])
 
 
 def judge(stacks: Sequence[Sequence[Image]], fringes: Sets, least_modulation: float) -> Quality:
@@ -74,8 +79,8 @@ def judge(stacks: Sequence[Sequence[Image]], fringes: Sets, least_modulation: fl
     unsaturated = np.zeros(shape, bool)
     phase = 2 * np.pi * np.arange(steps) / steps
     for stack in stacks:
-        top = full_scale(stack[0])
-        whole = np.maximum.reduce(stack) < top
+        level, top, _ = saturation_level(stack)
+        whole = np.maximum.reduce(stack) < level
         cosine, sine = (
             np.tensordot(weights.astype(np.float32), np.asarray(stack[start : start + steps], np.float32), 1)
             for weights in (np.cos(phase), np.sin(phase))

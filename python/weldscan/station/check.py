@@ -46,7 +46,7 @@ def latency_s(camera: Camera, projector: Projector, repeats: int = 5) -> tuple[f
     """
     black, white = _flats(camera, projector)
     low, high = float(black.mean()), float(white.mean())
-    if high - low < LEAST_CONTRAST * full_scale(white):
+    if high - low < LEAST_CONTRAST * full_scale([black, white]):
         raise DeviceError(f"{camera.name} does not see {projector.name}: black {low:.1f}, white {high:.1f}")
     found = []
     for _ in range(repeats):
@@ -70,7 +70,7 @@ def response(
     An image of each level is left in the folder `keep`, for `weldscan calibrate response`.
     """
     black, white = _flats(camera, projector)
-    top = full_scale(white)
+    top = full_scale([black, white])
     lit = (white < top) & (white.astype(np.int64) - black > LEAST_CONTRAST * top)
     if not lit.any():
         raise DeviceError(f"{camera.name}: no pixel is lit and unsaturated; change the exposure")
@@ -93,7 +93,7 @@ def gamma(response: Response) -> float:
 def pixels(camera: Camera, projector: Projector) -> Pixels:
     """Return which share of the image is saturated or dark."""
     black, white = _flats(camera, projector)
-    top = full_scale(white)
+    top = full_scale([black, white])
     return Pixels(
         saturated=float((white >= top).mean()),
         dark=float((white.astype(np.int64) - black <= LEAST_CONTRAST * top).mean()),
@@ -102,8 +102,8 @@ def pixels(camera: Camera, projector: Projector) -> Pixels:
 
 def overlay(image: Image, least: float = LEAST_CONTRAST) -> NDArray[np.uint8]:
     """Return a BGR picture for the operator: saturated pixels red, dark ones blue."""
-    top = full_scale(image)
-    grey = (image // (top // 255)).astype(np.uint8)
+    top = full_scale([image])
+    grey = (image // max(top // 255, 1)).clip(0, 255).astype(np.uint8)
     picture = np.repeat(grey[:, :, None], 3, axis=2)
     picture[image >= top] = (0, 0, 255)
     picture[image <= least * top] = (160, 0, 0)

@@ -171,7 +171,7 @@ def camera_preview(
     with read_cell(config).open("camera") as camera, contextlib.suppress(KeyboardInterrupt):
         while count == 0 or done < count:
             frame = camera.capture()
-            top = full_scale(frame.image)
+            top = full_scale([frame.image])
             fresh = out.with_name(f".{out.name}.new.png")
             cv2.imwrite(str(fresh), overlay(frame.image))
             fresh.replace(out)
@@ -200,7 +200,7 @@ def project(
         levels = {"white": 255, "black": 0}
         if pattern == "all":
             _, plan = read_settings(cell)
-            patterns = list(fringe_patterns([(f.axis, f.periods, f.steps) for f in plan.fringes], *size))
+            patterns = list(fringe_patterns([f.pattern for f in plan.fringes], *size))
         elif pattern in levels or (pattern.isdigit() and int(pattern) <= 255):
             patterns = [flat_pattern(levels.get(pattern, int(pattern) if pattern.isdigit() else 0), *size)]
         else:

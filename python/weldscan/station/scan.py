@@ -136,7 +136,7 @@ class _Scan:
         if size != (lens.width, lens.height):
             raise InputError(f"projector: {size[0]}x{size[1]}, but the plan's has {lens.width}x{lens.height} pixels")
         self.sets = [(fringe.axis, fringe.periods, fringe.steps) for fringe in plan.fringes]
-        self.patterns = [*fringe_patterns(self.sets, *size), flat_pattern(255, *size)]
+        self.patterns = [*fringe_patterns([f.pattern for f in plan.fringes], *size), flat_pattern(255, *size)]
 
     def run(self) -> ScanResult:
         rejected = []

@@ -372,6 +372,8 @@ pub(super) struct Decoder<'a, T> {
     shot: &'a Shot<'a, T>,
     /// First frame, number of steps, wave and limits of each set.
     sets: Vec<(usize, usize, Wave, Judge)>,
+    /// The sets that do not keep to the usual convention, as they are.
+    foreign: Vec<Option<FringeSet>>,
     /// What is taken off each set's phase: steps and series.
     errors: Vec<Option<(f32, Vec<f32>)>>,
     chain: Chain,
@@ -425,7 +427,8 @@ impl<'a, T: Level> Decoder<'a, T> {
             size: projector_size as f64,
             cyclic: plan.base.periods == 1.0 && sets.iter().all(|s| whole(s.periods)),
         };
-        Self { shot, sets: judged, errors: Vec::new(), chain }
+        let foreign = sets.iter().map(|s| (!s.is_plain()).then_some(*s)).collect();
+        Self { shot, sets: judged, foreign, errors: Vec::new(), chain }
     }
 
     /// Takes the projector's error off each set's phase.
@@ -452,6 +455,9 @@ impl<'a, T: Level> Decoder<'a, T> {
             }
             if let Some(Some((steps, terms))) = self.errors.get(i) {
                 response::compensate(*steps, terms, &mut set.phase);
+            }
+            if let Some(Some(stated)) = self.foreign.get(i) {
+                set.phase.iter_mut().for_each(|p| *p = stated.phase_of_measured(*p));
             }
         }
         unwrap(&self.chain, work, &mut out);

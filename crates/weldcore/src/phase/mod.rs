@@ -12,7 +12,9 @@
 mod jumps;
 mod kernel;
 mod noise;
+mod redundancy;
 mod response;
+mod saturation;
 mod wave;
 mod wrapped;
 
@@ -20,7 +22,9 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 pub use noise::{Noise, NoiseSource};
+pub use redundancy::Disagreement;
 pub use response::{ErrorSource, PhaseError, error_of_harmonics, harmonics_of_gamma, seen_in_phase};
+pub use saturation::{Saturation, saturation};
 pub use wave::Level;
 pub(crate) use wave::{round, round64};
 pub use wrapped::{WrappedPhase, decode_phase};
@@ -33,13 +37,35 @@ use jumps::reject_jumps;
 use kernel::{Decoder, Results, Work, demodulate};
 use wave::{Sinusoid, TILE, Wave};
 
-/// N steps of one frequency.
+/// N steps of one frequency: step k projects `0.5 + 0.5 cos(2π(periods (u + 0.5)/width) - direction 2πk/N + origin_rad)`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FringeSet {
     /// Periods over the projector's width (height for horizontal fringes).
     pub periods: f64,
     /// Number of steps, 3 or more.
     pub steps: usize,
+    /// 1, or -1 where the fringes move the other way from step to step.
+    pub direction: f64,
+    /// What the pattern's phase at the projector's border is more than zero in the first step.
+    pub origin_rad: f64,
+}
+
+impl FringeSet {
+    /// Steps that run the usual way, from phase zero.
+    pub const fn new(periods: f64, steps: usize) -> Self {
+        Self { periods, steps, direction: 1.0, origin_rad: 0.0 }
+    }
+
+    /// Does it keep to the usual convention?
+    pub(crate) fn is_plain(&self) -> bool {
+        self.direction > 0.0 && self.origin_rad == 0.0
+    }
+
+    /// The phase that counts fringes from the border, from the measured one `A + B cos(phi - 2πk/N)`, both in turns.
+    #[inline(always)]
+    pub(crate) fn phase_of_measured(&self, turns: f32) -> f32 {
+        self.direction as f32 * turns - (self.origin_rad / std::f64::consts::TAU) as f32
+    }
 }
 
 /// The images of one shot, all of the same size, row-major.
@@ -68,7 +94,7 @@ pub enum Compensation {
 /// Settings of [`decode_shot`]. The defaults follow from noise and geometry.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DecodeOptions {
-    /// The level at which the camera saturates; `None`: see [`saturation_level`].
+    /// The level at which the camera saturates; `None`: see [`saturation()`].
     pub saturation: Option<f64>,
     /// The safety factor z on sigma. At 5 noise alone decides one fringe order in two million wrongly.
     pub z: f64,
@@ -124,35 +150,16 @@ pub struct PhaseMap {
     pub noise: Noise,
     /// The level from which a pixel counts as saturated.
     pub saturation: f64,
+    /// Whether the images show that the camera clips below the full scale of its numbers.
+    pub clipped_below_full_scale: bool,
     /// Per set the rms of the higher harmonics over the first's amplitude; `None` with three steps, which show none.
     pub harmonics: Vec<Option<f64>>,
     /// Per set the error that was taken off its phase, for the projector's response.
     pub phase_error: Vec<PhaseError>,
     /// How the sets were unwrapped.
     pub plan: Plan,
-}
-
-/// Where the camera saturates, by its data. 8-bit images: 255. 16-bit images often hold fewer bits: the full scale of the
-/// narrowest of 8, 10, 12, 14 and 16 bits that holds the largest value, after a shift by the low bits that are zero in
-/// every pixel. Should this guess a narrower scale than the camera's, then at most pixels of exactly the largest value
-/// seen are lost.
-pub fn saturation_level<T: Level>(shot: &Shot<'_, T>) -> f64 {
-    if T::FULL == 255 {
-        return 255.0;
-    }
-    let frames: Vec<&[T]> = shot.exposures.iter().flatten().copied().collect();
-    let scan = |frame: &&[T]| {
-        frame.iter().fold((0u32, 0u32), |(top, bits), &v| {
-            let v: u32 = v.into();
-            (top.max(v), bits | v)
-        })
-    };
-    let seen: Vec<(u32, u32)> = threads::install(|| frames.par_iter().map(scan).collect());
-    let (top, bits) = seen.iter().fold((0, 0), |(top, bits), s| (top.max(s.0), bits | s.1));
-    let shift = if bits == 0 { 0 } else { bits.trailing_zeros() };
-    let full = [8, 10, 12, 14, 16].map(|b| (1u32 << b) - 1);
-    let scale = full.into_iter().find(|&f| f >= top >> shift).unwrap_or(T::FULL);
-    f64::from((scale << shift).min(T::FULL))
+    /// Where the frames contradict each other, and the likely cause; empty for a stack that agrees with itself.
+    pub disagreements: Vec<Disagreement>,
 }
 
 /// Decodes the fringe images of one axis of one shot. `projector_size` is the projector's extent along that axis, px.
@@ -168,13 +175,16 @@ pub fn decode_shot<T: Level>(
 ) -> Result<PhaseMap> {
     validate(shot, sets, projector_size, options)?;
     let plan = Plan::new(&sets.iter().map(|s| s.periods).collect::<Vec<_>>(), options.z)?;
-    let saturation = options.saturation.unwrap_or_else(|| saturation_level(shot));
+    let seen = options.saturation.is_none().then(|| self::saturation(shot));
+    let saturation = options.saturation.or(seen.map(|s| s.level)).unwrap_or(f64::INFINITY);
     let noise = noise::estimate(shot, sets, saturation as f32);
     let phase_error = match &options.compensation {
         Compensation::Off => sets.iter().map(|s| PhaseError::none(s.steps)).collect(),
         Compensation::Auto => response::seen_in_shot(shot, sets, &noise, saturation as f32, options.z),
         Compensation::Given(errors) => errors.clone(),
     };
+    let disagreements =
+        redundancy::disagreements(shot, sets, &plan, &noise, saturation as f32, &phase_error, options.z);
     let decoder = Decoder::new(shot, sets, &plan, projector_size, noise, saturation as f32, options.z as f32)
         .compensating(&phase_error);
 
@@ -210,15 +220,21 @@ pub fn decode_shot<T: Level>(
         counts: [0; REASONS],
         noise,
         saturation,
+        clipped_below_full_scale: seen.is_some_and(|s| s.below_full_scale),
         harmonics: harmonics(shot, sets, &noise, saturation as f32),
         phase_error,
         plan: plan.clone(),
+        disagreements,
     };
     if !plan.links.is_empty() {
         let finest = sets.get(plan.finest).map_or(1.0, |s| s.periods);
         reject_jumps(&mut map, 0.5 * projector_size as f64 / finest);
     }
     map.counts = count_reasons(&map.reason);
+    if map.disagreements.is_empty() {
+        let (columns, size) = (&map.column_px, projector_size as f64);
+        map.disagreements.extend(redundancy::run_over(columns, map.width, map.height, sets, &map.plan, size));
+    }
     Ok(map)
 }
 
@@ -257,6 +273,14 @@ fn validate<T>(shot: &Shot<'_, T>, sets: &[FringeSet], projector_size: usize, op
     if let Some(set) = sets.iter().find(|s| s.steps < 3) {
         let (expected, value) = ("3 or more".into(), set.steps.to_string());
         return Err(Error::OutOfRange { what: "steps of a fringe set", expected, value });
+    }
+    if let Some(set) = sets.iter().find(|s| s.direction.abs() != 1.0) {
+        let (expected, value) = ("1 or -1".into(), set.direction.to_string());
+        return Err(Error::OutOfRange { what: "direction of a fringe set", expected, value });
+    }
+    if let Some(set) = sets.iter().find(|s| !s.origin_rad.is_finite() || s.origin_rad.abs() > std::f64::consts::TAU) {
+        let (expected, value) = ("within one turn".into(), set.origin_rad.to_string());
+        return Err(Error::OutOfRange { what: "origin_rad of a fringe set", expected, value });
     }
     if let Compensation::Given(errors) = &options.compensation
         && !errors.iter().map(|e| e.steps).eq(sets.iter().map(|s| s.steps))
@@ -329,11 +353,8 @@ mod tests {
         }
     }
 
-    pub(super) const SETS: [FringeSet; 3] = [
-        FringeSet { periods: 59.0, steps: 4 },
-        FringeSet { periods: 64.0, steps: 5 },
-        FringeSet { periods: 70.0, steps: 12 },
-    ];
+    pub(super) const SETS: [FringeSet; 3] =
+        [FringeSet::new(59.0, 4), FringeSet::new(64.0, 5), FringeSet::new(70.0, 12)];
 
     /// Images of a slanted wall with some noise, saturation and darkness in it.
     pub(super) fn images(width: usize, height: usize) -> Vec<Vec<u8>> {

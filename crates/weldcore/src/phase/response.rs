@@ -176,7 +176,7 @@ pub(super) fn compensate(steps: f32, terms: &[f32], phase: &mut Lane) {
 
 /// The series `Σ terms[m - 1] sin(2π m steps p)` by Clenshaw.
 #[inline(always)]
-fn sine_series(steps: f32, terms: &[f32], p: f32) -> f32 {
+pub(super) fn sine_series(steps: f32, terms: &[f32], p: f32) -> f32 {
     let (sin, cos) = sin_cos_turns(steps * p);
     let (mut one, mut two) = (0.0f32, 0.0f32);
     for c in terms.iter().rev() {

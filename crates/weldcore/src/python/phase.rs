@@ -10,7 +10,8 @@ use super::response::PyPhaseError;
 use super::{Whole, compute, float_matrix, floats, parts, raise, whole};
 use crate::error::Error;
 use crate::phase::{
-    DecodeOptions, FringeSet, Level, PhaseMap, Shot, WrappedPhase, decode_phase as decode_phase_core, decode_shot,
+    DecodeOptions, Disagreement, FringeSet, Level, PhaseMap, Shot, WrappedPhase, decode_phase as decode_phase_core,
+    decode_shot, saturation,
 };
 use crate::unwrap::{GrayImages, absolute_from_gray, decode_gray as decode_gray_core};
 
@@ -22,6 +23,30 @@ pub(super) fn image<T: numpy::Element>(
     width: usize,
 ) -> PyResult<Py<PyArray2<T>>> {
     Ok(PyArray1::from_vec(py, values).reshape([height, width])?.unbind())
+}
+
+/// Frames of a stack that contradict each other, and the likely cause.
+#[pyclass(frozen, get_all, module = "weldscan", name = "Disagreement")]
+pub(crate) struct PyDisagreement {
+    /// The exposure that is concerned.
+    exposure: usize,
+    /// The fringe set that is concerned; None: several.
+    set: Option<usize>,
+    /// The frames of the exposure that are concerned, from 0.
+    frames: Vec<usize>,
+    /// The likely cause in one line; steps count from 0 in their set.
+    text: String,
+    /// Share of the clear pixels that contradict the frames as they are stated.
+    share: f64,
+    /// How many times better the cause fits than the statement.
+    strength: f64,
+}
+
+#[pymethods]
+impl PyDisagreement {
+    fn __repr__(&self) -> String {
+        format!("Disagreement({:?}, {:.0} % of the pixels)", self.text, 100.0 * self.share)
+    }
 }
 
 /// What `decode` found. Arrays have the camera's shape (H, W).
@@ -48,6 +73,10 @@ pub(crate) struct PyPhaseMap {
     noise_source: &'static str,
     /// Level from which a pixel counts as saturated.
     saturation: f64,
+    /// Whether the images show that the camera clips there, below the full scale of its numbers.
+    clipped_below_full_scale: bool,
+    /// Where the frames contradict each other, and the likely cause. Empty for a stack that agrees with itself.
+    disagreements: Vec<Py<PyDisagreement>>,
     /// Per fringe set the rms of the higher harmonics over the amplitude (None with three steps, which show none).
     /// Above 0.05 or so the projector's gamma wants correcting.
     harmonics: Vec<Option<f64>>,
@@ -75,6 +104,10 @@ fn hand_over(py: Python<'_>, map: PhaseMap) -> PyResult<PyPhaseMap> {
     let (h, w) = (map.height, map.width);
     let chain = std::iter::once(map.plan.base.periods).chain(map.plan.links.iter().map(|l| l.signal.periods));
     let errors = map.phase_error.iter().map(|e| Py::new(py, PyPhaseError::from(e)));
+    let disagreements = map.disagreements.into_iter().map(|d| {
+        let Disagreement { exposure, set, frames, text, share, strength } = d;
+        Py::new(py, PyDisagreement { exposure, set, frames, text, share, strength })
+    });
     Ok(PyPhaseMap {
         phase_error: errors.collect::<PyResult<_>>()?,
         unwrapped_by: chain.collect(),
@@ -88,6 +121,8 @@ fn hand_over(py: Python<'_>, map: PhaseMap) -> PyResult<PyPhaseMap> {
         noise_gain: map.noise.gain,
         noise_source: map.noise.source.name(),
         saturation: map.saturation,
+        clipped_below_full_scale: map.clipped_below_full_scale,
+        disagreements: disagreements.collect::<PyResult<_>>()?,
         harmonics: map.harmonics,
     })
 }
@@ -100,6 +135,24 @@ fn frame<'py, T: numpy::Element>(given: &Bound<'py, PyAny>) -> PyResult<Option<P
     }
     let copy = given.py().import("numpy")?.call_method1("ascontiguousarray", (array,))?;
     Ok(Some(copy.cast_into::<PyArray2<T>>()?.readonly()))
+}
+
+/// A fringe set as it comes.
+#[derive(FromPyObject)]
+enum Fringe {
+    Plain((f64, Whole)),
+    Foreign((f64, Whole, f64, f64)),
+}
+
+impl From<Fringe> for FringeSet {
+    fn from(fringe: Fringe) -> Self {
+        match fringe {
+            Fringe::Plain((periods, steps)) => Self::new(periods, steps.0),
+            Fringe::Foreign((periods, steps, direction, origin_rad)) => {
+                Self { periods, steps: steps.0, direction, origin_rad }
+            }
+        }
+    }
 }
 
 fn decode_as<T: Level + numpy::Element>(
@@ -139,8 +192,8 @@ fn decode_as<T: Level + numpy::Element>(
 
 /// The projector column that lights each camera pixel, from N-step fringe images of one axis.
 ///
-/// Step i of a set projects `0.5 + 0.5 cos(2 pi (periods (u + 0.5)/projector_size - i/steps))` into column u. Any number
-/// of steps from 3 on and any frequencies that count the fringes over the whole projector will do, in any order: a set
+/// Step i of a set projects `0.5 + 0.5 cos(2 pi (periods (u + 0.5)/projector_size - direction i/steps) + origin_rad)` into
+/// column u; direction is 1 and origin_rad 0 where they are not given. Any number of steps from 3 on and any frequencies that count the fringes over the whole projector will do, in any order: a set
 /// of one period and finer ones (1, 8, 64), or sets whose beats come down to one period (59, 64, 70).
 ///
 /// The camera's noise, `variance = read² + 1/12 + gain level`, is estimated from the images: from the differences of the
@@ -150,17 +203,20 @@ fn decode_as<T: Level + numpy::Element>(
 ///
 /// Args:
 ///     exposures: list of stacks; a stack is a list of (H, W) uint8 or uint16 images, sets after sets, steps in order.
-///     fringes: list of (periods, steps), in the order of the images.
+///     fringes: list of (periods, steps) or (periods, steps, direction, origin_rad), in the order of the images. A
+///         direction of -1 and an origin read stacks that others projected.
 ///     projector_size: extent of the projector along the fringes' axis, px (width for axis x).
-///     saturation: level at which the camera saturates. Default: 255 for uint8; for uint16 the full scale of the narrowest
-///         of 8, 10, 12, 14 and 16 bits that holds the largest value, after a shift by the low bits that are always zero.
+///     saturation: level at which the camera saturates. Default: where values are piled up at the upper end, as those of a
+///         camera that clips at 235 of 255; else 255 for uint8, and for uint16 the full scale of the narrowest of 8, 10,
+///         12, 14 and 16 bits that holds the largest value, after a shift by the low bits that are always zero.
 ///     z: safety factor on sigma, for what is dark and for fringe orders.
 ///     phase_error: what is taken off each set's phase for the projector's response (gamma). None: nothing. "auto": what
 ///         the phases themselves show above the noise, see `estimate_phase_error`. Or per set the coefficients of
 ///         `sin(m steps phase)`, m = 1, 2 ..., rad (None: nothing).
 ///
 /// Returns:
-///     PhaseMap: `column_px`, `sigma_px`, `modulation`, `background`, `reason` (H, W) and the noise model. Rejected pixels
+///     PhaseMap: `column_px`, `sigma_px`, `modulation`, `background`, `reason` (H, W), the noise model, and `disagreements`
+///     where frames are copied, exchanged, displaced or of another convention than stated. Rejected pixels
 ///     are NaN in column and sigma, with a reason:
 ///     1 dark: the modulation is below z sigma, or z sigma of a fringe-order decision reaches half a fringe;
 ///     2 saturated: some set is saturated in every exposure;
@@ -209,15 +265,61 @@ fn decode(
         let frames: Vec<_> = list(stack.bind(py))?.into_iter().map(|f| f.into_bound(py)).collect();
         stacks.push(frames);
     }
-    let fringes: Vec<(f64, Whole)> = parts("fringes", "a list of (periods, steps)", fringes)?;
-    let sets: Vec<FringeSet> =
-        fringes.into_iter().map(|(periods, steps)| FringeSet { periods, steps: steps.0 }).collect();
+    let sets: Vec<FringeSet> = parts::<Vec<Fringe>>(
+        "fringes",
+        "a list of (periods, steps) or (periods, steps, direction, origin_rad)",
+        fringes,
+    )?
+    .into_iter()
+    .map(FringeSet::from)
+    .collect();
     let options = DecodeOptions { saturation, z, compensation: super::response::compensation(py, phase_error, &sets)? };
     let wide = stacks.first().and_then(|f| f.first()).is_some_and(|f| f.cast::<PyArray2<u16>>().is_ok());
     if wide {
         decode_as::<u16>(py, &stacks, &sets, projector_size, &options)
     } else {
         decode_as::<u8>(py, &stacks, &sets, projector_size, &options)
+    }
+}
+
+/// Where a camera saturates, by the images of one stack: (level, full scale, whether it clips below full scale).
+///
+/// Full scale is 255 for uint8, for uint16 that of the narrowest of 8, 10, 12, 14 and 16 bits that holds the largest value,
+/// after a shift by the low bits that are always zero. Fringe images show a pile-up of values where a camera clips below.
+///
+/// Args:
+///     images: (H, W) uint8 or uint16 images, all alike.
+///
+/// Returns:
+///     (float, float, bool), grey levels.
+///
+/// Raises:
+///     InputError: no images, or images that are not alike.
+///
+/// Example:
+///     >>> import numpy as np
+///     >>> from weldscan._weldcore import saturation_level
+///     >>> saturation_level([np.full((4, 4), 700, np.uint16)])
+///     (1023.0, 1023.0, False)
+#[pyfunction]
+fn saturation_level(py: Python<'_>, images: &Bound<'_, PyAny>) -> PyResult<(f64, f64, bool)> {
+    fn look<T: Level + numpy::Element>(
+        py: Python<'_>,
+        arrays: &[PyReadonlyArray2<'_, T>],
+        [height, width]: [usize; 2],
+    ) -> PyResult<(f64, f64, bool)> {
+        let shot = Shot { exposures: vec![slices(arrays)?], width, height };
+        let found = compute(py, || Ok(saturation(&shot)))?;
+        Ok((found.level, found.full_scale, found.below_full_scale))
+    }
+    let (found, size) = self::images("images", images)?;
+    match &found {
+        Images::U8(a) => look(py, a, size),
+        Images::U16(a) => look(py, a, size),
+        Images::F64(_) => {
+            let (expected, got) = ("uint8 or uint16 images, all alike".into(), "another type".into());
+            Err(raise(py, &Error::Shape { what: "images", expected, got }))
+        }
     }
 }
 
@@ -554,9 +656,11 @@ fn decode_gray<'py>(
 
 pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<PyPhaseMap>()?;
+    m.add_class::<PyDisagreement>()?;
     m.add_class::<PyWrappedPhase>()?;
     m.add_function(wrap_pyfunction!(decode, m)?)?;
     m.add_function(wrap_pyfunction!(decode_phase, m)?)?;
+    m.add_function(wrap_pyfunction!(saturation_level, m)?)?;
     m.add_function(wrap_pyfunction!(unwrap_temporal, m)?)?;
     m.add_function(wrap_pyfunction!(unwrap_spatial, m)?)?;
     m.add_function(wrap_pyfunction!(decode_gray, m)?)

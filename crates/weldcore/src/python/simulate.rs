@@ -224,13 +224,21 @@ impl PyShot {
     }
 }
 
+/// A fringe set as it comes.
+#[derive(FromPyObject)]
+enum Fringe {
+    Plain((String, f64, Whole)),
+    Foreign((String, f64, Whole, f64, f64)),
+}
+
 /// Renders the fringe images of one shot of an analytic scene, with their truth.
 ///
 /// Args:
 ///     scanner: `Scanner`.
 ///     scene_from_scanner: (4, 4), where the scanner (its camera) stands in the scene, mm.
 ///     bodies: what stands in the scene: `weldscan.devices.simulated.Body`.
-///     fringes: sets of (axis "x" or "y", periods, steps); none for white images alone.
+///     fringes: sets of (axis "x" or "y", periods, steps), or these and (direction 1 or -1, origin_rad) as a session has
+///         them; none for white images alone.
 ///     photometry: lamp, room, projector and sensor: `weldscan.devices.simulated.Photometry`.
 ///     exposures: factors on the light, one stack of frames each.
 ///     seed: start of the random numbers.
@@ -277,10 +285,16 @@ fn simulate_shot(
             Err(raise(py, &Error::OutOfRange { what: "fringe axis", expected: "\"x\" or \"y\"".into(), value }))
         }
     };
-    let fringes: Vec<(String, f64, Whole)> = parts("fringes", "a list of (axis, periods, steps)", fringes)?;
-    let fringes = fringes
+    let expected = "a list of (axis, periods, steps) or (axis, periods, steps, direction, origin_rad)";
+    let fringes = parts::<Vec<Fringe>>("fringes", expected, fringes)?
         .into_iter()
-        .map(|(name, periods, steps)| Ok(FringeSet { axis: axis(&name)?, periods, steps: steps.0 }))
+        .map(|fringe| {
+            let (name, periods, steps, direction, origin_rad) = match fringe {
+                Fringe::Plain((name, periods, steps)) => (name, periods, steps, 1.0, 0.0),
+                Fringe::Foreign(all) => all,
+            };
+            Ok(FringeSet { axis: axis(&name)?, periods, steps: steps.0, direction, origin_rad })
+        })
         .collect::<PyResult<Vec<_>>>()?;
     let p: PyPhotometry = photometry.extract().map_err(|e| wrong_object(py, "photometry", e))?;
     let photometry = Photometry {

@@ -50,7 +50,7 @@ pub enum Axis {
     Y,
 }
 
-/// One set of phase-shifted fringes.
+/// One set of phase-shifted fringes, by the convention of [`crate::phase::FringeSet`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FringeSet {
     /// Direction of the phase.
@@ -59,6 +59,10 @@ pub struct FringeSet {
     pub periods: f64,
     /// Frames, shifted by 2π/steps each.
     pub steps: usize,
+    /// 1, or -1 where the fringes move the other way from step to step.
+    pub direction: f64,
+    /// The pattern's phase at the projector's border in the first step.
+    pub origin_rad: f64,
 }
 
 /// Lamp, room, projector and sensor. Light is in parts of the sensor's full scale.
@@ -266,6 +270,11 @@ fn check(bodies: &[Body], fringes: &[FringeSet], exposures: &[f64], photometry: 
         if !(1..=1024).contains(&set.steps) {
             let value = set.steps.to_string();
             return Err(Error::OutOfRange { what: "fringe steps", expected: "1 to 1024".into(), value });
+        }
+        if set.direction.abs() != 1.0 || !set.origin_rad.is_finite() {
+            let value = format!("{}, {}", set.direction, set.origin_rad);
+            let expected = "1 or -1, and finite".into();
+            return Err(Error::OutOfRange { what: "fringe direction and origin_rad", expected, value });
         }
     }
     exposures.iter().try_for_each(|&e| require_positive("exposures", e))?;
@@ -524,7 +533,7 @@ impl Shader<'_> {
         if place.is_nan() {
             return (1.0, 0.0);
         }
-        let (sin, cos) = (TAU * (set.periods * (place + 0.5) / side as f64).fract()).sin_cos();
+        let (sin, cos) = (TAU * (set.periods * (place + 0.5) / side as f64).fract() + set.origin_rad).sin_cos();
         (cos as f32, sin as f32)
     }
 
@@ -565,7 +574,7 @@ impl Shader<'_> {
         for (set, light) in self.fringes.iter().zip(light) {
             let phases: Vec<(f32, f32)> = samples.iter().map(|s| self.phase(set, s)).collect();
             for i in 0..set.steps {
-                let (sin, cos) = (TAU * i as f64 / set.steps as f64).sin_cos();
+                let (sin, cos) = (set.direction * TAU * i as f64 / set.steps as f64).sin_cos();
                 let (sin, cos) = (sin as f32, cos as f32);
                 let value =
                     |s: &Sample, (c, q): (f32, f32)| s.direct * cosine_series(light, c * cos + q * sin) + s.ambient;

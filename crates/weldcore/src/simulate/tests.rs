@@ -142,7 +142,7 @@ fn the_light_of_a_pattern_is_its_blurred_power() {
             bits: 8,
             seed: 0,
         };
-        let set = FringeSet { axis: Axis::X, periods, steps: 4 };
+        let set = FringeSet { axis: Axis::X, periods, steps: 4, direction: 1.0, origin_rad: 0.0 };
         let shader = Shader {
             scanner: &scanner,
             fringes: &[set],

@@ -15,8 +15,9 @@ import pytest
 
 from conftest import shared
 from test_simulate import small_scanner
-from weldscan import InputError, set_threads
+from weldscan import InputError, inspection, set_threads
 from weldscan.calibration.hand_eye import calibrate
+from weldscan.calibration_margin import CalibrationMargin
 from weldscan.devices.simulated import DEFAULT, NO_BEAD, Bead, pipe, simulate_session
 from weldscan.inspection import inspect
 from weldscan.result import Inspection, Verdict
@@ -169,6 +170,21 @@ def test_the_verdict_follows_the_step(recorded, tmp_path):
     assert found.verdict is Verdict.PASS and found.frame == "base"
     simulate_session(tmp_path / "session", replace(CELL, weld=pipe(offset_mm=2.0)))
     assert inspect(tmp_path / "session").verdict is Verdict.FAIL
+
+
+def test_a_calibration_bars_where_the_margin_is_smaller_than_it_takes(recorded, monkeypatch):
+    folder, _, before = recorded
+    strict, lax = "pnae-g-7-010-89", "iso-5817:D"
+    assert before.calibration == "not stated" and not [said for said in before.bars if said.code == "calibration"]
+    upper = before.step.max_abs_mm + before.step.expanded_uncertainty_mm
+    # Between the margins to 1.1 and to 3 mm.
+    takes = CalibrationMargin(2.0 - upper, 170.0, stated=False)
+    monkeypatch.setattr(inspection, "calibration_margin", lambda *_: takes)
+    found = inspect(folder, norms=(strict, lax))
+    verdicts = {judgement.norm: judgement for judgement in found.verdicts}
+    assert verdicts[strict].verdict is Verdict.INCONCLUSIVE and verdicts[lax].verdict is Verdict.PASS
+    assert [said.code for said in verdicts[strict].barred_by] == ["calibration"] and not verdicts[lax].barred_by
+    assert [said.code for said in found.bars] == ["calibration"] and found.step.max_abs_mm == before.step.max_abs_mm
 
 
 def test_the_same_bits_on_any_number_of_threads(recorded):

@@ -25,6 +25,7 @@ from weldscan.calibration.hand_eye import (
     point_uncertainty_mm,
     pose_sigma,
 )
+from weldscan.calibration_margin import CalibrationMargin, Unevenness, calibration_above, calibration_margin
 from weldscan.description import held_against_itself, held_against_record, held_against_scan, not_used, other_part
 from weldscan.errors import GeometryError, InputError
 from weldscan.manifest import faults as faults_of
@@ -149,6 +150,7 @@ class _Run:
         self.response = response
         self.read = reader(self.session, progress, _compensation(response))
         self.seam: Seam | None = None
+        self.calibration: CalibrationMargin | None = None
         self.agreement: tuple[ShotAgreement, ...] = ()
         faults = faults_of(self.session.folder)
         self.left_out: list[tuple[str, str]] = [(fault.shot, fault.reason) for fault in faults]
@@ -221,6 +223,15 @@ class _Run:
             "views" if required is None else by,
         )
         self.read.findings += self.seam.findings
+        self.calibration = calibration_margin(
+            self.session.scanner,
+            self.read.scanner,
+            welds,
+            found.angle_deg,
+            self.part.wall_thickness,
+            Unevenness(step["residual_rms_mm"], *step["correlation_mm"]),
+            self.read.axis,
+        )
         t = self.read.clock("seam", t)
         deviations = step["deviation_mm"]
         cloud = PartCloud(
@@ -287,9 +298,9 @@ class _Run:
             self.read.findings.append(note("response", compensated["note"]))
         if (said := about_verification(self.standing)) is not None:
             self.read.findings.append(said)
-        doubts = {norm: self.edges_above(norm, step) for norm in self.norms}
-        self.read.findings += dict.fromkeys(said for said in doubts.values() if said is not None)
-        common = [finding for finding in self.read.findings if finding not in doubts.values()]
+        common = list(self.read.findings)
+        doubts = {norm: self.doubts_of(norm, step, value, expanded) for norm in self.norms}
+        self.read.findings += dict.fromkeys(said for found in doubts.values() for said in found)
         verdicts = [
             verdict
             for norm in self.norms
@@ -301,7 +312,7 @@ class _Run:
                 why_not_measured=reason,
                 coverage_deg=coverage,
                 required_coverage_deg=self.required_deg,
-                bars=[*common, *(said for said in (doubts[norm],) if said is not None)],
+                bars=[*common, *doubts[norm]],
             )
         ]
         timing = self.read.timing
@@ -334,17 +345,28 @@ class _Run:
             coverage=self.seam.coverage if self.seam else None,
         )
 
-    def edges_above(self, norm: str, step: StepResult | None) -> Finding | None:
-        """A bar where the walls keep a norm's limit and the surfaces beside the toes may not."""
-        if step is None or step.edge_upper_mm is None or step.judged == "edge" or self.method == "paper":
+    def doubts_of(
+        self, norm: str, step: StepResult | None, value_mm: float | None, expanded_mm: float | None
+    ) -> list[Finding]:
+        """What bars PASS under one norm alone: whether it does depends on the limit."""
+        limits = [each.limit_mm for each in judge(norm, 0.0, 0.0, self.part.model_dump()) if each.limit_mm is not None]
+        if step is None or not limits:
+            return []
+        limit_mm = min(limits)
+        found = [self.edges_above(limit_mm, step)]
+        if value_mm is not None and expanded_mm is not None:
+            found.append(calibration_above(self.calibration, limit_mm, abs(value_mm) + expanded_mm))
+        return [said for said in found if said is not None]
+
+    def edges_above(self, limit_mm: float, step: StepResult) -> Finding | None:
+        """A bar where the walls keep a limit and the surfaces beside the toes may not."""
+        if step.edge_upper_mm is None or step.judged == "edge" or self.method == "paper":
             return None
-        part = self.part.model_dump()
-        limits = [each.limit_mm for each in judge(norm, 0.0, 0.0, part) if each.limit_mm is not None]
-        if not limits or step.edge_upper_mm <= min(limits):
+        if step.edge_upper_mm <= limit_mm:
             return None
         text = (
             f"the surfaces right beside the weld stand up to {step.edge_upper_mm:.3f} mm apart, as far as they can be "
-            f"read, where the limit is {min(limits):.3f} mm; the undisturbed walls, extrapolated, keep it"
+            f"read, where the limit is {limit_mm:.3f} mm; the undisturbed walls, extrapolated, keep it"
         )
         return bar("edges", text)
 

@@ -62,6 +62,10 @@ LEAST_EIGENVALUE = 1e-13
 LEAST_CORNERS = 12
 
 
+# Amplitude of a weld's shrinkage, one sigma: the core's prior of it.
+SHRINKAGE_MM = 0.25
+
+
 @dataclass(frozen=True)
 class Unevenness:
     """What the walls' fit left, as `measure_step` found it: it sets how the fit weighs near and far points."""
@@ -346,7 +350,10 @@ def step_jacobians(
         moves.append(left[:, 7:])
     if not rows:
         return ()
-    x, y = np.concatenate(rows), np.concatenate(moves)
+    # As in the core: a weld draws a wall in by some tenths of a millimetre, and by nothing as a rule.
+    prior = np.zeros((2, 7))
+    prior[:, 5:] = np.eye(2) / SHRINKAGE_MM
+    x, y = np.concatenate([*rows, prior]), np.concatenate([*moves, np.zeros((2, moves[0].shape[1]))])
     seam = np.radians(np.asarray(angle_deg, dtype=float))
     at_seam = _cylinder(seam, np.zeros_like(seam))
     return tuple(at_seam @ np.linalg.lstsq(x[:, :terms], y, rcond=None)[0][:5] for terms in (5, 7))

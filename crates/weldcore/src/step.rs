@@ -141,6 +141,10 @@ const TABLE: usize = 4096;
 const FULL_PART: f64 = 0.25;
 /// Beyond this degree a polynomial over one shot's arc describes dents, which the departure of single bins does better.
 const MAX_SHAPE_DEGREE: usize = 8;
+/// Amplitude of a weld's shrinkage, one sigma; half a millimetre is the most.
+const SHRINKAGE_MM: f64 = 0.25;
+/// What walls depart from their model as a rule, before it is known of these.
+const USUAL_UNEVENNESS_MM: f64 = 0.02;
 /// A bin's departure from the model counts from this many sigma.
 const DEPARTURE_SIGMAS: f64 = 3.0;
 
@@ -208,6 +212,12 @@ impl Model<'_> {
 
     fn shells(&self) -> usize {
         if self.terms.shell { 2 } else { 0 }
+    }
+
+    /// The columns of the walls' shrinkage.
+    fn shell_columns(&self) -> std::ops::Range<usize> {
+        let first = self.arcs.len() * (CYLINDER + self.shapes());
+        first..first + self.shells()
     }
 
     fn columns(&self) -> usize {
@@ -279,7 +289,7 @@ impl Model<'_> {
         let mut row = vec![0.0; self.columns()];
         self.reference_row(cell.shot, cell.angle, cell.axial, &mut row);
         if self.terms.shell {
-            let at = self.arcs.len() * (CYLINDER + self.shapes()) + usize::from(cell.other);
+            let at = self.shell_columns().start + usize::from(cell.other);
             row[at] = shell_term(cell.axial, self.arcs[cell.shot].radius_mm, self.thickness_mm);
         }
         if cell.other {
@@ -324,8 +334,13 @@ fn solve(model: &Model, cells: &[Cell], whitener: &Whitener) -> Result<Solution>
             rows[(i, j)] = v;
         }
     }
+    let shells = model.shell_columns();
+    let weight = whitener.unit_mm / SHRINKAGE_MM;
     let mut white = rows.clone();
     white.column_iter_mut().for_each(|mut c| whitener.apply(c.as_mut_slice()));
+    // The prior: a weld draws a wall in by some tenths of a millimetre, and by nothing as a rule.
+    white = white.insert_rows(cells.len(), shells.len(), 0.0);
+    shells.clone().enumerate().for_each(|(k, column)| white[(cells.len() + k, column)] = weight);
     let qr = white.qr();
     let (q, r) = (qr.q(), qr.r());
     let size = r.amax();
@@ -342,6 +357,7 @@ fn solve(model: &Model, cells: &[Cell], whitener: &Whitener) -> Result<Solution>
     for _ in 0..3 {
         let mut white = bent.clone();
         whitener.apply(white.as_mut_slice());
+        let white = white.insert_rows(cells.len(), shells.len(), 0.0);
         parameters = &inverse * (q.tr_mul(&white));
         for (i, cell) in cells.iter().enumerate() {
             bent[i] =
@@ -493,11 +509,13 @@ fn fitted_support(lags: &[(f64, f64)], cell_mm: f64, sill: Option<f64>) -> (f64,
 /// correlated, and in their order around the axis that leaves a narrow band.
 struct Whitener {
     rows: Vec<(usize, Vec<f64>)>,
+    /// What a whitened residual of usual size is: 1 where the covariance is known, else a length.
+    unit_mm: f64,
 }
 
 impl Whitener {
     fn identity(cells: usize) -> Self {
-        Self { rows: (0..cells).map(|i| (i, vec![1.0])).collect() }
+        Self { rows: (0..cells).map(|i| (i, vec![1.0])).collect(), unit_mm: USUAL_UNEVENNESS_MM }
     }
 
     fn of(arcs: &[Arc], cells: &[Cell], covariance: &Covariance) -> Self {
@@ -519,7 +537,7 @@ impl Whitener {
             row.push(rest.max(0.5 * covariance.nugget).sqrt());
             rows.push((first, row));
         }
-        Self { rows }
+        Self { rows, unit_mm: 1.0 }
     }
 
     /// `L⁻¹ x`, in place.
@@ -825,6 +843,7 @@ impl Normal {
         });
         let n = model.columns();
         let mut all = Self { matrix: DMatrix::zeros(n, n), right: DVector::zeros(n), square: 0.0 };
+        model.shell_columns().for_each(|k| all.matrix[(k, k)] = (whitener.unit_mm / SHRINKAGE_MM).powi(2));
         for (own, matrix, right, square) in parts {
             all.square += square;
             for (i, &a) in own.iter().enumerate() {

@@ -623,7 +623,7 @@ impl Scene {
             for d in &wall.dents {
                 numbers.extend([d.depth_mm, d.at_rad]);
                 require_positive("dent width_rad", d.width_rad)?;
-                if !(d.decay_mm > 0.0) {
+                if d.decay_mm.is_nan() || d.decay_mm <= 0.0 {
                     return refuse("dent decay_mm", "above 0 (infinite for the whole wall)", d.decay_mm.to_string());
                 }
             }
@@ -639,7 +639,7 @@ impl Scene {
             numbers.extend([s.height_mm, s.ring_mm]);
             require_positive("second seam width_mm", s.width_mm)?;
             let least = 0.5 * (s.width_mm + c.width_mm);
-            if !(s.distance_mm.abs() > least) {
+            if s.distance_mm.is_nan() || s.distance_mm.abs() <= least {
                 return refuse("second seam distance_mm", "beyond the first cap", s.distance_mm.to_string());
             }
         }

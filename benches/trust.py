@@ -3,8 +3,8 @@
     python benches/trust.py --runs 30 --markdown docs/trust.md      # all kinds, 30 seeds each
     python benches/trust.py --kinds plain,taper --runs 10 --first 1000 --list
 
-A wrong PASS is a PASS of a seam whose true step is above the limit; a lost verdict is an honest seam (true step at most 0.8 of
-the limit) without a PASS. Clouds go in where images would, with the noise of the scene; `--images` records whole sessions.
+A wrong PASS is a PASS of a seam whose true step is above the limit; a lost verdict is an honest seam (true step at most
+0.8 of the limit) without a PASS. Clouds go in where images would, with the scene's noise; `--images` records sessions.
 """
 
 from __future__ import annotations
@@ -124,8 +124,8 @@ def _line(row: dict) -> str:
     if row["value"] is None:
         why = "; ".join(f"{shot}: {reason[:90]}" for shot, reason in row["left_out"][:2])
     return (
-        f"{row['kind']:22} {row['seed']:5} {row['verdict']:12} true {row['true']:.3f} of {row['limit']:.2f} got {value} "
-        f"[{row['size']}] {row['seconds']:.1f}s {why}{wrong}"
+        f"{row['kind']:22} {row['seed']:5} {row['verdict']:12} true {row['true']:.3f} of {row['limit']:.2f} "
+        f"got {value} [{row['size']}] {row['seconds']:.1f}s {why}{wrong}"
     )
 
 
@@ -153,7 +153,7 @@ def _table(rows: list[dict], kinds: list[str]) -> str:
     for group, (lost, of) in totals.items():
         if of:
             out.append(
-                f"\nHonest scenes of the {group} kinds that lose their verdict: {lost} of {of} ({100 * lost / of:.1f} %)."
+                f"\nHonest scenes of the {group} kinds without a PASS: {lost} of {of} ({100 * lost / of:.1f} %)."
             )
     over = [row for row in rows if row.get("over")]
     out.append(
@@ -169,8 +169,9 @@ def _page(table: str, rows: list[dict], asked: argparse.Namespace) -> str:
     return (
         "# Does a PASS hold?\n\n"
         f"`python benches/trust.py --runs {asked.runs} --first {asked.first}`: {len(rows)} scenes as {how}, weldscan "
-        f"{__version__}, {date.today()}. What a kind is: [the simulated cell](simulator.md). A wrong PASS is one of a seam whose true "
-        "step, between the surfaces at the toes, is above the limit of PNAE G-7-010-89; honest seams have at most 0.8 of it.\n\n"
+        f"{__version__}, {date.today()}. What a kind is: [the simulated cell](simulator.md). A wrong PASS is one of a "
+        "seam whose true step, between the surfaces at the toes, is above the limit of PNAE G-7-010-89; honest seams "
+        "have at most 0.8 of it.\n\n"
         f"{table}\n"
     )
 

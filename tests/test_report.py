@@ -17,6 +17,7 @@ from synthetic import PART, barred, inspection, nothing_measured, seam_bin, with
 from weldscan import InputError, read_result
 from weldscan.report import FATE_NAMES, FILES, write_report
 from weldscan.report.charts import Limit, arcs_of, nice_ticks, seam_chart, unseen_arcs
+from weldscan.report.document import BOTH_STEPS
 from weldscan.report.pictures import diverging
 from weldscan.result import CODES, FATES, Coverage, Label, Standing, Verdict, bar, note, warning
 
@@ -243,6 +244,11 @@ def test_the_profile_is_a_table(made, tmp_path):
     write_report(made, tmp_path / "out")
     text = (tmp_path / "out" / "profile.csv").read_text()
     assert text.startswith("angle_deg,step_mm,u_mm,along_mm\n")
+    both = {name: made.step.u_mm + k for k, name in enumerate(BOTH_STEPS)}
+    write_report(replace(made, step=replace(made.step, **both)), tmp_path / "both")
+    more = (tmp_path / "both" / "profile.csv").read_text().splitlines()
+    assert more[0] == "angle_deg,step_mm,u_mm,along_mm,wall_step_mm,wall_u_mm,edge_step_mm,edge_u_mm"
+    assert np.allclose(np.loadtxt(more, delimiter=",", skiprows=1)[:, 4:], np.stack([*both.values()], 1), atol=5e-6)
     table = np.loadtxt(text.splitlines(), delimiter=",", skiprows=1)
     assert np.allclose(table[:, :3], np.stack([made.step.angle_deg, made.step.step_mm, made.step.u_mm], 1), atol=5e-6)
     assert np.allclose(table[:, 3], made.step.angle_deg / 360 * math.pi * PART["outside_diameter"], atol=5e-4)

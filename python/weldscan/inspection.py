@@ -112,8 +112,8 @@ def inspect(
     hand_eye = hand_eye_of(run.read, run.left_out)
     # 5-6  every part shot: its points, its place in base, reference wall, other wall and bead
     welds = [weld for shot in run.part_shots if (weld := run.weld(shot, hand_eye)) is not None]
-    # 7    the step: all shots in one model, each against its own reference wall; the surfaces beside the toes; what became
-    #      of every pixel; and the paper's chain
+    # 7    the step: all shots in one model, each against its own reference wall; the surfaces beside the toes; what
+    #      became of every pixel; and the paper's chain
     step, cloud = run.measure(welds, hand_eye)
     # 8    the verdict
     return run.judged(step, cloud, hand_eye)

@@ -18,6 +18,9 @@ Floats = NDArray[np.float64]
 BINS, BIN_DEG = 180, 2.0
 # Beyond this angle between a surface and the rays of camera or projector nobody is surprised to see no fringes.
 STEEPEST_DEG = 50.0
+# Of the ends of all views, from the gentlest: some may end early for the very reason that a gap is looked for. And what
+# one end may be short of another: stations are millimetres long.
+USUAL_END, END_MARGIN_DEG = 0.4, 5.0
 # So much of either wall beside its toe must be in view for a bin to be expected: what the edge is read from.
 BESIDE_MM = 6.0
 # A pixel's width of the image's border is not relied on.
@@ -113,37 +116,58 @@ def _stations_by_bin(view: PartView) -> dict[int, NDArray[np.intp]]:
 
 def expected_bins(views: Sequence[PartView], scanner: Scanner) -> set[int]:
     """The bins that these views should have seen, by poses, lenses and the pipe: whole, with the walls beside the weld,
-    in both images, and not too steep to either ray.
+    in both images, and not steeper to either ray than what these views measure elsewhere.
     """
-    expected: set[int] = set()
-    projector = np.asarray(scanner.camera_from_projector)[:3, 3]
-    for view in views:
-        shot = view.shot
-        toes = shot.sections["toes_mm"]
-        if np.isnan(toes).all():
-            continue
-        low, high = np.nanmedian(toes[:, 0]) - BESIDE_MM, np.nanmedian(toes[:, 1]) + BESIDE_MM
-        margin = BIN_DEG / 2 + math.degrees(shot.station_mm / shot.radius_mm)
-        square = np.cross(shot.axis, shot.zero)
-        inside = np.ones(BINS, bool)
-        for off in (-margin, 0.0, margin):
-            angle = np.radians(BIN_DEG * np.arange(BINS) + off)[:, None]
-            normal = np.cos(angle) * shot.zero + np.sin(angle) * square
-            for along in (low, 0.0, high):
-                points = shot.origin_mm + shot.axis * along + normal * shot.radius_mm
-                inside &= points[:, 2] > 0
-                for pixels, lens in (
-                    (scanner.camera.project(points), scanner.camera),
-                    (scanner.project_to_projector(points), scanner.projector),
-                ):
-                    size = np.array([lens.width, lens.height]) - 1 - BORDER_PX
-                    inside &= ((pixels >= BORDER_PX) & (pixels <= size)).all(axis=1)
-                for eye in (np.zeros(3), projector):
-                    ray = eye - points
-                    cosine = np.einsum("ij,ij->i", ray, normal) / np.linalg.norm(ray, axis=1)
-                    inside &= cosine > math.cos(math.radians(STEEPEST_DEG))
-        expected |= set(np.flatnonzero(inside).tolist())
-    return expected
+    fields = [field for view in views if (field := _field(view, scanner)) is not None]
+    # Where a view ends within both images, the light ends it: so steep can this surface be measured.
+    ends = [end for view, field in zip(views, fields, strict=False) for end in _ends(view, *field)]
+    steepest = max(STEEPEST_DEG, float(np.quantile(ends, USUAL_END)) - END_MARGIN_DEG) if ends else STEEPEST_DEG
+    return {int(k) for inside, steep in fields for k in np.flatnonzero(inside & (steep < steepest))}
+
+
+def _field(view: PartView, scanner: Scanner) -> tuple[NDArray[np.bool_], Floats] | None:
+    """Per bin: whether it lies in both images, and the angle between its surface and the steeper ray, degrees."""
+    shot = view.shot
+    toes = shot.sections["toes_mm"]
+    if np.isnan(toes).all():
+        return None
+    low, high = np.nanmedian(toes[:, 0]) - BESIDE_MM, np.nanmedian(toes[:, 1]) + BESIDE_MM
+    margin = BIN_DEG / 2 + math.degrees(shot.station_mm / shot.radius_mm)
+    square = np.cross(shot.axis, shot.zero)
+    inside, steep = np.ones(BINS, bool), np.zeros(BINS)
+    for off in (-margin, 0.0, margin):
+        angle = np.radians(BIN_DEG * np.arange(BINS) + off)[:, None]
+        normal = np.cos(angle) * shot.zero + np.sin(angle) * square
+        for along in (low, 0.0, high):
+            points = shot.origin_mm + shot.axis * along + normal * shot.radius_mm
+            inside &= points[:, 2] > 0
+            for pixels, lens in (
+                (scanner.camera.project(points), scanner.camera),
+                (scanner.project_to_projector(points), scanner.projector),
+            ):
+                size = np.array([lens.width, lens.height]) - 1 - BORDER_PX
+                inside &= ((pixels >= BORDER_PX) & (pixels <= size)).all(axis=1)
+            for eye in (np.zeros(3), np.asarray(scanner.camera_from_projector)[:3, 3]):
+                ray = eye - points
+                cosine = np.einsum("ij,ij->i", ray, normal) / np.linalg.norm(ray, axis=1)
+                steep = np.maximum(steep, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    return inside, steep
+
+
+def _ends(view: PartView, inside: NDArray[np.bool_], steep: Floats) -> list[float]:
+    """How steep the outermost bins are that a view measured, where the next one is in both images too."""
+    read = np.isfinite(view.shot.sections["edge_step_mm"])
+    seen = {k for k, stations in _stations_by_bin(view).items() if read[stations].any() and inside[k]}
+    if not seen:
+        return []
+    middle = min(seen, key=lambda k: steep[k])
+    ends = []
+    for way in (-1, 1):
+        end = max((way * ((k - middle + BINS // 2) % BINS - BINS // 2) for k in seen), default=0)
+        last, beyond = (middle + way * end) % BINS, (middle + way * (end + 1)) % BINS
+        if end > 0 and inside[beyond]:
+            ends.append(float(steep[last]))
+    return ends
 
 
 def coverage_of(measured: Iterable[int], expected: Iterable[int], required_deg: float | None, by: str) -> Coverage:
@@ -208,7 +232,9 @@ def seam_of(
     """
     measured = set(measured)
     tables = [seam_fates(view.shot, np.ascontiguousarray(view.reason), scanner) for view in views]
-    every = np.sum([t[0] for t in tables], axis=0, dtype=np.int64) if tables else np.zeros((BINS, len(FATES)), int)
+    every: NDArray[np.int64] = np.zeros((BINS, len(FATES)), np.int64)
+    for whole, _ in tables:
+        every += whole
     expected = expected_bins(views, scanner)
     coverage = coverage_of(measured, expected, required_deg, required_by)
     wanted = set(range(BINS)) if coverage.required_deg >= 360 else expected
@@ -227,8 +253,9 @@ def seam_of(
     )
     findings = [*_of_coverage(coverage)]
     for view, (whole, near) in zip(views, tables, strict=True):
-        findings += _of_fates(view.name, whole, near)
+        findings += _of_fates(view.name, whole, near, measured | expected)
         findings += [bar(code, text, view.name, angle) for code, angle, text in view.shot.doubts]
+    findings += _of_lost([view.name for view in views], [near for _, near in tables], measured | expected, expected)
     return Seam(bins, coverage, tuple(findings))
 
 
@@ -258,31 +285,51 @@ def _of_coverage(coverage: Coverage) -> list[Finding]:
     return [bar("coverage", f"{text}: nothing is known of {arcs}" if arcs else text, None, at)]
 
 
-def _of_fates(name: str, whole: NDArray[np.uint32], near: NDArray[np.uint32]) -> list[Finding]:
-    """Bars for one shot: points that no wall took, and too many pixels lost at the weld."""
+def _of_fates(name: str, whole: NDArray[np.uint32], near: NDArray[np.uint32], judged: set[int]) -> list[Finding]:
+    """Bars for one shot: points that no wall took, in the bins that are judged or should be."""
     findings = []
+    of_seam = np.isin(np.arange(BINS), list(judged))
     for table, where in ((near, "at the weld"), (whole, "of the view")):
         points, odd = table[:, POINTS].sum(axis=1), table[:, UNEXPLAINED].sum(axis=1)
-        share = np.where(points >= LEAST_PIXELS, odd / np.maximum(points, 1), 0.0)
+        share = np.where(of_seam & (points >= LEAST_PIXELS), odd / np.maximum(points, 1), 0.0)
         if (share > UNEXPLAINED_PART).any():
             k = int(np.argmax(share))
             text = f"{odd[k]} of {points[k]} points {where} belong neither to a wall nor to the cap: what are they?"
             findings.append(bar("points-without-wall", text, name, BIN_DEG * k))
             break
-    total = near.sum(axis=1)
-    saturated = np.where(total >= LEAST_PIXELS, near[:, INDEX["saturated"]] / np.maximum(total, 1), 0.0)
-    if (saturated > SATURATED_PART).any():
-        k = int(np.argmax(saturated))
-        text = (
-            f"{100 * saturated[k]:.0f} % of the pixels at the weld are saturated: what is left "
-            "is no sample of its surface; scan with a shorter exposure"
-        )
-        findings.append(bar("saturation", text, name, BIN_DEG * k))
-    lost = 1 - near[:, POINTS].sum(axis=1) / np.maximum(total, 1)
-    # Where hardly anything was measured there is no step either, and the coverage says so.
-    some = (near[:, POINTS].sum(axis=1) >= LEAST_PIXELS) & (lost > LOST_PART) & (saturated <= SATURATED_PART)
-    if some.any():
-        k = int(np.argmax(np.where(some, lost, 0.0)))
-        text = f"{100 * lost[k]:.0f} % of the pixels at the weld were not measured"
-        findings.append(bar("coverage", text, name, BIN_DEG * k))
+    return findings
+
+
+def _of_lost(
+    names: Sequence[str], near: Sequence[NDArray[np.uint32]], judged: set[int], expected: set[int]
+) -> list[Finding]:
+    """Bars for bins in which too many pixels at the weld were lost in every view: saturated, for what is left is
+    flanks, in those that are judged; lost at all in those that should have been seen.
+    """
+    if not len(near):
+        return []
+    of_seam, in_view = (np.isin(np.arange(BINS), list(bins)) for bins in (judged, expected))
+    table = np.stack(near).astype(np.float64)
+    total = table.sum(axis=2)
+    filled = total >= LEAST_PIXELS
+    shares = {
+        "saturated": table[:, :, INDEX["saturated"]] / np.maximum(total, 1),
+        "lost": 1 - table[:, :, POINTS].sum(axis=2) / np.maximum(total, 1),
+    }
+    # By the view that shows a bin best; a view without pixels there says nothing.
+    best = {name: np.where(filled, share, np.inf).min(axis=0) for name, share in shares.items()}
+    findings = []
+    flanks = "saturated: what is left is no sample of its surface; scan with a shorter exposure"
+    rules = (
+        ("saturated", "saturation", SATURATED_PART, of_seam, flanks),
+        ("lost", "coverage", LOST_PART, in_view, "not measured"),
+    )
+    for name, code, part, bins, text in rules:
+        share = np.where(bins & np.isfinite(best[name]), best[name], 0.0)
+        if share.max() > part:
+            k = int(np.argmax(share))
+            view = names[int(np.argmin(np.where(filled[:, k], shares[name][:, k], np.inf)))]
+            said = f"{100 * share[k]:.0f} % of the pixels at the weld were {text}"
+            findings.append(bar(code, said, view, BIN_DEG * k))
+            break
     return findings

@@ -365,8 +365,8 @@ fn sort_points(sections: &Sections, unrolled: &Unrolled, thickness_mm: f64) -> (
     // What little a station without a weld of its own holds is held against its neighbour's.
     let beds: Vec<Option<(usize, Bed)>> = (0..own.len())
         .map(|k| {
-            let near = [k, k.wrapping_sub(1), k + 1, k.wrapping_sub(2), k + 2];
-            near.into_iter().find_map(|j| Some((j, (*own.get(j)?)?)))
+            let mut near = (0..=4).flat_map(|d: usize| [k.wrapping_sub(d), k + d]);
+            near.find_map(|j| Some((j, (*own.get(j)?)?)))
         })
         .collect();
     let tolerance = TOLERANCE_MM.max(5.0 * sections.noise_mm) + 4.0 * sections.noise_mm;
@@ -485,10 +485,10 @@ fn undrawn(
     thickness_mm: f64,
 ) -> Vec<[f64; 3]> {
     // One amplitude: that of a single station is known too badly.
-    let mut all: Vec<f64> =
-        sections.stations.iter().filter_map(|s| s.walls[0].map(|run| run.shrinkage)).collect();
+    let mut all: Vec<f64> = sections.stations.iter().filter_map(|s| s.walls[0].map(|run| run.shrinkage)).collect();
     let drawn = if all.is_empty() { 0.0 } else { median(&mut all) };
-    let mut middles: Vec<f64> = sections.stations.iter().filter_map(|s| s.toes_mm.map(|t| 0.5 * (t[0] + t[1]))).collect();
+    let mut middles: Vec<f64> =
+        sections.stations.iter().filter_map(|s| s.toes_mm.map(|t| 0.5 * (t[0] + t[1]))).collect();
     let middle = if middles.is_empty() { 0.0 } else { median(&mut middles) };
     let square = coarse.axis.cross(&coarse.zero);
     let wall = (0..points.len()).filter(|&i| labels[i] == Label::ReferenceWall as u8);

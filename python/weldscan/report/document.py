@@ -154,7 +154,7 @@ BOTH_STEPS = ("wall_step_mm", "wall_u_mm", "edge_step_mm", "edge_u_mm")
 
 
 def profile(step: StepResult | None, part: Mapping[str, Any]) -> list[dict[str, float]]:
-    """The measured bins: those that hold a number with its uncertainty. `step_mm` is the judged one of the two steps."""
+    """The measured bins: those that hold a number with its uncertainty; `step_mm` is the judged one of both steps."""
     if step is None:
         return []
     columns: dict[str, Any] = {"angle_deg": step.angle_deg, "step_mm": step.step_mm, "u_mm": step.u_mm}
@@ -172,7 +172,8 @@ def _along(angle_deg: float, part: Mapping[str, Any]) -> dict[str, float]:
 def profile_csv(step: StepResult | None, part: Mapping[str, Any]) -> str:
     """The profile as rows of text."""
     text = io.StringIO()
-    names = ("angle_deg", "step_mm", "u_mm", "along_mm", *BOTH_STEPS)
+    both = () if step is None else tuple(name for name in BOTH_STEPS if getattr(step, name) is not None)
+    names = ("angle_deg", "step_mm", "u_mm", "along_mm", *both)
     text.write(",".join(names) + "\n")
     for row in profile(step, part):
         cells = (f"{row[name]:.5f}" if name in row else "" for name in names[1:])

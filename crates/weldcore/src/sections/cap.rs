@@ -164,12 +164,8 @@ pub(super) fn course(found: &[Vec<Candidate>], along: &[f64]) -> Option<Course> 
     let (&cell, _) =
         votes.iter().max_by(|a, b| heap(*a.0).total_cmp(&heap(*b.0)).then(a.1.total_cmp(b.1)).then(b.0.cmp(a.0)))?;
     let voted = (cell as f64 + 0.5) * VOTE_MM;
-    let mut width: Vec<f64> = found
-        .iter()
-        .flatten()
-        .filter(|c| (c.middle() - voted).abs() < 1.5 * VOTE_MM)
-        .map(Candidate::width)
-        .collect();
+    let mut width: Vec<f64> =
+        found.iter().flatten().filter(|c| (c.middle() - voted).abs() < 1.5 * VOTE_MM).map(Candidate::width).collect();
     let width = crate::statistics::median(&mut width);
     // The seam may lean in the frame: a station's candidate is the one nearest to the vote, within a cap's width and what
     // the seam leans over the view.

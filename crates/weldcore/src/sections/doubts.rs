@@ -59,15 +59,21 @@ impl View<'_> {
         let wide = among(&|_, s| Some(worth(s)).filter(|w| *w > self.widest_mm));
         if let Some((k, w)) = worst(&wide).filter(|_| wide.len() >= 2 && part(wide.len()) >= PART) {
             let (most, t) = (self.widest_mm, self.thickness_mm);
-            say("cap", k, format!(
-                "what lies between the walls is up to {w:.1} mm wide, a cap on a wall of {t} mm at most {most:.0} mm: \
+            say(
+                "cap",
+                k,
+                format!(
+                    "what lies between the walls is up to {w:.1} mm wide, a cap on a wall of {t} mm at most {most:.0} mm: \
                  a taper, a machined end or another surface was taken for it"
-            ));
+                ),
+            );
         }
         if found.kind == Kind::Raised {
             self.humps(&among, &worst, &part, &mut say);
             let second = among(&|k, _| self.second_weld(k, found));
-            if let Some((k, gap)) = worst(&second).filter(|_| neighbours(&second, 3) || part(second.len()) >= SECOND_PART) {
+            if let Some((k, gap)) =
+                worst(&second).filter(|_| neighbours(&second, 3) || part(second.len()) >= SECOND_PART)
+            {
                 say("cap", k, format!("two seams are in view, {gap:.0} mm apart: which of them is to be measured?"));
             }
         }
@@ -79,7 +85,11 @@ impl View<'_> {
             let most = (HOLLOW_THICKNESSES * self.thickness_mm).min(HOLLOW_MM[1]).max(HOLLOW_MM[0]);
             let deep = among(&|_, s| Some(s.height_mm.abs()).filter(|d| *d > most || *d > HOLLOW_WIDTHS * worth(s)));
             if let Some((k, d)) = worst(&deep).filter(|_| neighbours(&deep, 2)) {
-                say("cap", k, format!("a groove {d:.2} mm deep runs along the seam: the edges of the walls are not known"));
+                say(
+                    "cap",
+                    k,
+                    format!("a groove {d:.2} mm deep runs along the seam: the edges of the walls are not known"),
+                );
             }
         }
         for side in 0..2 {
@@ -97,7 +107,13 @@ impl View<'_> {
             Some(depth).filter(|d| *d > GROOVE_MM.max(GROOVE_THICKNESSES * self.thickness_mm))
         });
         if let Some((k, d)) = worst(&groove).filter(|_| neighbours(&groove, 2)) {
-            say("cap", k, format!("a groove {d:.2} mm deep lies beside the cap: an undercut, or an edge that was taken for the toe"));
+            say(
+                "cap",
+                k,
+                format!(
+                    "a groove {d:.2} mm deep lies beside the cap: an undercut, or an edge that was taken for the toe"
+                ),
+            );
         }
         let no_edge = among(&|_, s| s.edge.is_none().then_some(0.0));
         if let Some((k, _)) = worst(&no_edge).filter(|_| neighbours(&no_edge, 2)) {
@@ -119,7 +135,11 @@ impl View<'_> {
             });
             if let Some((k, away)) = worst(&unknown).filter(|_| unknown.len() >= 2 && part(unknown.len()) > PART) {
                 let where_from = if away.is_finite() { format!(" nearer than {away:.0} mm") } else { String::new() };
-                say("walls", k, format!("the {name} is not seen undisturbed{where_from}: what it was before the weld is not known"));
+                say(
+                    "walls",
+                    k,
+                    format!("the {name} is not seen undisturbed{where_from}: what it was before the weld is not known"),
+                );
             }
             let shell = SHELL_LENGTHS * (self.grid.radius_mm * self.thickness_mm).sqrt();
             let off = among(&|_, s| {
@@ -130,10 +150,14 @@ impl View<'_> {
                 (too_far || (length > shell && departs > 2.0 * super::TOLERANCE_MM)).then_some(departs)
             });
             if let Some((k, d)) = worst(&off).filter(|_| neighbours(&off, 2)) {
-                say("transition", k, format!(
-                    "beside the weld the {name} departs by {d:.2} mm from where it runs undisturbed, more than weld \
+                say(
+                    "transition",
+                    k,
+                    format!(
+                        "beside the weld the {name} departs by {d:.2} mm from where it runs undisturbed, more than weld \
                      shrinkage explains ({SHRINKAGE_MM} mm over {shell:.0} mm): a taper, a counterbore, a flare, a dent or a coat"
-                ));
+                    ),
+                );
             }
         }
         doubts
@@ -161,7 +185,11 @@ impl View<'_> {
             Some(valley).filter(|v| *v > VALLEY_MM.max(VALLEY_HEIGHTS * top) + 3.0 * self.sigma)
         });
         if let Some((k, v)) = worst(&humps).filter(|_| humps.len() >= 2 && part(humps.len()) >= HUMPS_PART) {
-            say("cap", k, format!("the cap has two humps with a valley of {v:.2} mm between them: two welds, or an edge in it"));
+            say(
+                "cap",
+                k,
+                format!("the cap has two humps with a valley of {v:.2} mm between them: two welds, or an edge in it"),
+            );
         }
         let aside = among(&|k, s| {
             let (over, top) = heights(k, s)?;
@@ -178,9 +206,10 @@ impl View<'_> {
     fn second_weld(&self, k: usize, found: &Found) -> Option<f64> {
         let first = found.course.chosen[k].as_ref()?;
         let far = |c: &&Candidate| c.toes[0] > first.toes[1] || c.toes[1] < first.toes[0];
-        let second = found.candidates[k].iter().filter(far).find(|c| {
-            c.score > SECOND_SCORE && c.height > SECOND_HEIGHTS * first.height
-        })?;
+        let second = found.candidates[k]
+            .iter()
+            .filter(far)
+            .find(|c| c.score > SECOND_SCORE && c.height > SECOND_HEIGHTS * first.height)?;
         Some((second.middle() - first.middle()).abs())
     }
 
@@ -228,7 +257,8 @@ pub(super) fn over_chord(profile: &Profile, from: usize, to: usize) -> Option<Ve
 
 /// The deepest valley between two humps: what the lower of them stands over the lowest place between, smoothed over five.
 fn valley(over: &[f64]) -> f64 {
-    let smooth: Vec<f64> = over.windows(5.min(over.len().max(1))).map(|w| w.iter().sum::<f64>() / w.len() as f64).collect();
+    let smooth: Vec<f64> =
+        over.windows(5.min(over.len().max(1))).map(|w| w.iter().sum::<f64>() / w.len() as f64).collect();
     let mut highest_after = vec![f64::NEG_INFINITY; smooth.len() + 1];
     for i in (0..smooth.len()).rev() {
         highest_after[i] = highest_after[i + 1].max(smooth[i]);

@@ -49,7 +49,8 @@ pub(super) fn read(profile: &Profile, toe: f64, cap_height: f64, sigma: f64) -> 
     }
     // From the noisiest to the least noisy: the last that agrees with all before it.
     found.sort_by(|a, b| b.1.variance.total_cmp(&a.1.variance).then(a.0.total_cmp(&b.0)));
-    let agrees = |i: usize| found[..i].iter().all(|(_, f)| (f.value - found[i].1.value).abs() <= 2.0 * f.variance.sqrt());
+    let agrees =
+        |i: usize| found[..i].iter().all(|(_, f)| (f.value - found[i].1.value).abs() <= 2.0 * f.variance.sqrt());
     let chosen = (0..found.len()).rev().find(|&i| agrees(i))?;
     let best = &found[chosen].1;
     let as_good = found[..=chosen].iter().filter(|(_, f)| f.variance <= 4.0 * best.variance).map(|(_, f)| f.value);

@@ -42,6 +42,8 @@ const FLUSH_PART: f64 = 0.5;
 const FLUSH_STRENGTH: f64 = 5.0;
 /// A station is seen where this part of the usual bins near the weld holds points.
 const SEEN_PART: f64 = 0.3;
+/// The edge of a view.
+const EDGE_MM: f64 = 2.0;
 /// Near the weld: so far beyond its toes.
 const NEAR_MM: f64 = 8.0;
 /// A wall is read beside the weld where at least this much of it is in view, or as much as the cap is wide.
@@ -77,7 +79,7 @@ pub struct Edge {
     pub standard_mm: f64,
     /// What the choice of the toes may hide, in full.
     pub hull_mm: f64,
-    /// Part of it: what looks like the foot of the cap and may be the wall's own edge.
+    /// Part of it: what looks like the foot of the cap, or like an undercut, and may be the wall's own edge.
     pub foot_mm: f64,
 }
 
@@ -220,18 +222,9 @@ impl<'a> View<'a> {
         };
         let rows: Vec<usize> = (0..grid.stations).collect();
         let (smooth, own) = threads::install(|| {
-            rows.par_iter()
-                .map(|&k| (both(&smoothed[k * grid.bins..(k + 1) * grid.bins]), both(grid.row(k))))
-                .unzip()
+            rows.par_iter().map(|&k| (both(&smoothed[k * grid.bins..(k + 1) * grid.bins]), both(grid.row(k)))).unzip()
         });
-        Self {
-            grid,
-            smooth,
-            own,
-            thickness_mm,
-            sigma: grid.cell_sigma_mm,
-            widest_mm: widest_cap_mm(thickness_mm),
-        }
+        Self { grid, smooth, own, thickness_mm, sigma: grid.cell_sigma_mm, widest_mm: widest_cap_mm(thickness_mm) }
     }
 
     fn along(&self, station: usize) -> f64 {
@@ -244,9 +237,7 @@ impl<'a> View<'a> {
 
     fn candidates(&self, sign: f64) -> Vec<Vec<Candidate>> {
         let search = SEARCH_WIDTHS * self.widest_mm;
-        threads::install(|| {
-            self.smooth.par_iter().map(|p| cap::candidates(&p[1], search, self.sigma, sign)).collect()
-        })
+        threads::install(|| self.smooth.par_iter().map(|p| cap::candidates(&p[1], search, self.sigma, sign)).collect())
     }
 
     /// Raised, hollow or flush, and its course.
@@ -311,6 +302,10 @@ impl<'a> View<'a> {
                 let second_line = second as f64 / filled.max(1) as f64;
                 Ok(Found { kind: Kind::Flush, course, candidates: as_candidates, second_line })
             }
+            _ if self.ends_in_metal() => {
+                let reason = "something stands up at the edge of the view: only one wall is in view".into();
+                Err(Error::NotFound { what: "weld", reason })
+            }
             _ => {
                 let reason = format!(
                     "{} of {filled} stations of {:.1} mm show neither a cap nor an edge: no weld is in view",
@@ -320,6 +315,21 @@ impl<'a> View<'a> {
                 Err(Error::NotFound { what: "weld", reason })
             }
         }
+    }
+
+    /// Whether the view ends on a weld: most stations leave the line of their middle at one end.
+    fn ends_in_metal(&self) -> bool {
+        let leaves = |p: &Profile| {
+            let n = p.len();
+            let (strip, middle) = (p.in_bins(EDGE_MM), p.line(n / 4, n - n / 4));
+            let off = |from: usize, to: usize| {
+                p.mean(from, to)
+                    .zip(middle)
+                    .is_some_and(|((x, h), line)| (h - line.at(x)).abs() > 2.0 * TOLERANCE_MM + 4.0 * self.sigma)
+            };
+            off(0, strip.min(n)) || off(n.saturating_sub(strip), n)
+        };
+        2 * self.smooth.iter().filter(|p| leaves(&p[1])).count() > self.smooth.len()
     }
 
     /// A toe of a station: side 0 is the reference wall's.
@@ -357,15 +367,13 @@ impl<'a> View<'a> {
         }
         // The middle and the usual width, for stations that have none of their own.
         let usual: [f64; 2] = std::array::from_fn(|side| {
-            let mut off: Vec<f64> = (0..count)
-                .filter_map(|k| Some(toes[k][side]?.at - found.course.at(self.along(k))))
-                .collect();
+            let mut off: Vec<f64> =
+                (0..count).filter_map(|k| Some(toes[k][side]?.at - found.course.at(self.along(k)))).collect();
             if off.is_empty() { 0.0 } else { median(&mut off) }
         });
-        let mut stations: Vec<Station> = threads::install(|| {
-            (0..count).into_par_iter().map(|k| self.station(k, found, toes[k], usual)).collect()
-        });
-        // A ripple of the cap has a foot too; an end that flares has it in all neighbours.
+        let mut stations: Vec<Station> =
+            threads::install(|| (0..count).into_par_iter().map(|k| self.station(k, found, toes[k], usual)).collect());
+        // A ripple of the cap has a foot and a groove too; an end that flares has it in all neighbours.
         let feet: Vec<Option<f64>> = stations.iter().map(|s| s.edge.map(|e| e.foot_mm)).collect();
         for (k, station) in stations.iter_mut().enumerate() {
             if let Some(edge) = &mut station.edge {
@@ -493,8 +501,8 @@ impl<'a> View<'a> {
             let (hull, foot) = if found.kind == Kind::Flush {
                 (0.0, 0.0)
             } else {
-                let hull = leaning[0] * doubt(0) + leaning[1] * doubt(1) + self.groove(k, found, station);
-                (hull, self.foot(k, found, toes, [a.height, b.height]))
+                let foot = self.foot(k, found, toes, [a.height, b.height]) + self.groove(k, found, station);
+                (leaning[0] * doubt(0) + leaning[1] * doubt(1), foot)
             };
             Some(Edge {
                 step_mm: b.height - a.height - slope * width,
@@ -506,12 +514,12 @@ impl<'a> View<'a> {
         let middle = 0.5 * (toes[0].at + toes[1].at);
         if found.kind == Kind::Flush {
             // Nobody knows where the toes of a ground weld were: the reading that is furthest from zero counts.
-            let gaps =
-                std::iter::once(0.5 * FLUSH_GAP_MM).chain(FLUSH_GAPS.iter().map(|g| 0.5 * FLUSH_GAP_MM + g * self.widest_mm));
+            let gaps = std::iter::once(0.5 * FLUSH_GAP_MM)
+                .chain(FLUSH_GAPS.iter().map(|g| 0.5 * FLUSH_GAP_MM + g * self.widest_mm));
             let all: Vec<Edge> = gaps.filter_map(|half| read([middle - half, middle + half])).collect();
-            let most = all.iter().max_by(|a, b| {
-                (a.step_mm.abs() + a.expanded_mm()).total_cmp(&(b.step_mm.abs() + b.expanded_mm()))
-            });
+            let most = all
+                .iter()
+                .max_by(|a, b| (a.step_mm.abs() + a.expanded_mm()).total_cmp(&(b.step_mm.abs() + b.expanded_mm())));
             return (most.copied(), 0.0);
         }
         (read([toes[0].at, toes[1].at]), height)
@@ -568,6 +576,8 @@ const ROUNDED_MM: f64 = 0.35;
 /// A cap is steepest at its toe, but for its ripples. Where the last millimetre has less than this part of the steepest
 /// slope, it may be something else than the cap.
 const FOOT_SLOPE: f64 = 0.5;
+/// A flank that hides behind its cap shows no foot: at least this part of it must be seen.
+const FLANK_PART: f64 = 0.7;
 
 fn foot(profile: &Profile, toe: f64, far: f64, beside: f64, sign: f64, sigma: f64) -> f64 {
     // The last strip is rounded by the toe itself and by the size of a pixel.
@@ -577,7 +587,11 @@ fn foot(profile: &Profile, toe: f64, far: f64, beside: f64, sign: f64, sigma: f6
         return 0.0;
     }
     let steep: Vec<(f64, f64, f64)> = (from..=to - window)
-        .filter_map(|i| profile.line(i, i + window).map(|l| (0.5 * (profile.edge(i) + profile.edge(i + window)), -sign * l.slope, sigma / l.sxx.sqrt())))
+        .filter_map(|i| {
+            profile
+                .line(i, i + window)
+                .map(|l| (0.5 * (profile.edge(i) + profile.edge(i + window)), -sign * l.slope, sigma / l.sxx.sqrt()))
+        })
         .collect();
     let Some(&(_, last, se)) = steep.last() else { return 0.0 };
     let most = steep.iter().map(|s| s.1).fold(0.0, f64::max);
@@ -586,6 +600,9 @@ fn foot(profile: &Profile, toe: f64, far: f64, beside: f64, sign: f64, sigma: f6
         return 0.0;
     }
     let at = profile.boundary(x);
+    if profile.count(at, to) < FLANK_PART * (to - at) as f64 {
+        return 0.0;
+    }
     profile.mean(at.saturating_sub(1), (at + 1).min(profile.len())).map_or(0.0, |(_, h)| (h - beside).abs())
 }
 
@@ -595,4 +612,3 @@ fn running_median(values: &[Option<f64>], at: usize, reach: usize) -> Option<f64
         values[at.saturating_sub(reach)..(at + reach + 1).min(values.len())].iter().flatten().copied().collect();
     (near.len() >= 3).then(|| median(&mut near))
 }
-

@@ -86,13 +86,7 @@ fn flank(profile: &Profile, begin: usize, end: usize) -> Option<usize> {
 }
 
 /// The boundary with the least sum of squares, and the range of those that are as plausible.
-fn search(
-    profile: &Profile,
-    from: usize,
-    to: usize,
-    sigma: f64,
-    band: Option<[f64; 2]>,
-) -> Option<(usize, [f64; 2])> {
+fn search(profile: &Profile, from: usize, to: usize, sigma: f64, band: Option<[f64; 2]>) -> Option<(usize, [f64; 2])> {
     let (low, high) = band.map_or((from + 3, to - 4), |[low, high]| {
         (profile.boundary(low).max(from + 3), profile.boundary(high).min(to - 4))
     });

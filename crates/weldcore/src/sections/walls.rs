@@ -133,10 +133,12 @@ impl<'a> Side<'a> {
         let wide = self.profile.in_bins(BLOCK_MM);
         let first = self.profile.boundary(from);
         let run = *run;
-        self.between(from, to).chunk_by(move |a, b| (a.index - first) / wide == (b.index - first) / wide).map(move |block| {
-            let off = |b: &Bin| b.height - run.height - run.slope * b.z - run.shrinkage * b.shell;
-            block.iter().map(off).sum::<f64>() / block.len() as f64
-        })
+        self.between(from, to).chunk_by(move |a, b| (a.index - first) / wide == (b.index - first) / wide).map(
+            move |block| {
+                let off = |b: &Bin| b.height - run.height - run.slope * b.z - run.shrinkage * b.shell;
+                block.iter().map(off).sum::<f64>() / block.len() as f64
+            },
+        )
     }
 
     fn fit(&self, from: f64, to: f64, sigma: f64) -> Option<WallRun> {

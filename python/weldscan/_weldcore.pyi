@@ -6,6 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
+    "Disagreement",
+    "saturation_level",
+    "seam_fates",
     "Cloud",
     "Cylinder",
     "CylinderFit",

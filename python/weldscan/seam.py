@@ -28,7 +28,7 @@ BORDER_PX = 4.0
 # Of a bin's points: holes have edges, and dust lies on any part. More is a surface that nobody recognised.
 UNEXPLAINED_PART = 0.10
 # Of the pixels at the weld of a bin: fewer measured ones are no sample of its surface any more.
-SATURATED_PART, LOST_PART = 0.50, 0.70
+SATURATED_PART, LOST_PART = 0.50, 0.75
 # Three sigma of what is stated with k = 2.
 CONTRADICTION = 1.5
 # A bin with fewer pixels is the sliver of a view.

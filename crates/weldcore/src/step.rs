@@ -116,6 +116,8 @@ pub struct Step {
     pub tilt_standard_rad: f64,
     /// Legendre degree up to which the walls' shape was needed (2: cylinders suffice).
     pub shape_degree: usize,
+    /// What the weld drew the reference wall and the other wall in, where the data show it; else 0.
+    pub shrinkage_mm: [f64; 2],
     /// Rms of the cells about the model.
     pub residual_rms_mm: f64,
     /// Distance at which the residuals' correlation ends, around and along the axis.
@@ -776,6 +778,10 @@ pub fn measure(shots: &[Shot], known: &Known) -> Result<Step> {
         tilt_standard_rad: along(3) / scale_mm,
         tilt_rad: (p[3].hypot(p[4]) / scale_mm).atan(),
         shape_degree: terms.shape,
+        shrinkage_mm: {
+            let mut drawn = model(terms).shell_columns().map(|k| chosen.parameters[k]);
+            std::array::from_fn(|_| drawn.next().unwrap_or(0.0))
+        },
         residual_rms_mm: (chosen.residuals.iter().map(|r| r * r).sum::<f64>() / cells.len() as f64).sqrt(),
         correlation_mm: covariance.support_mm,
         effective_cells: whitener.effective_count(covariance.nugget + covariance.sill),
@@ -818,12 +824,15 @@ struct Normal {
     square: f64,
 }
 
+/// A shot's part: its columns, their products, their products with what is left, and its square.
+type Part = (Vec<usize>, DMatrix<f64>, DVector<f64>, f64);
+
 impl Normal {
     fn of(model: &Model, cells: &[Cell], whitener: &Whitener, residuals: &[f64]) -> Self {
         let starts: Vec<usize> = (0..=model.arcs.len()).map(|k| cells.partition_point(|c| c.shot < k)).collect();
         let shots: Vec<usize> = (0..model.arcs.len()).collect();
         // The columns of another shot are zero in a shot's rows, and whitening stays within a shot.
-        let parts: Vec<(Vec<usize>, DMatrix<f64>, DVector<f64>, f64)> = threads::install(|| {
+        let parts: Vec<Part> = threads::install(|| {
             shots
                 .par_iter()
                 .map(|&k| {

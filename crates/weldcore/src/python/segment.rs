@@ -220,6 +220,7 @@ fn measure_step<'py>(
     out.set_item("tilt_rad", step.tilt_rad)?;
     out.set_item("tilt_standard_rad", step.tilt_standard_rad)?;
     out.set_item("shape_degree", step.shape_degree)?;
+    out.set_item("shrinkage_mm", step.shrinkage_mm)?;
     out.set_item("residual_rms_mm", step.residual_rms_mm)?;
     out.set_item("correlation_mm", step.correlation_mm)?;
     out.set_item("effective_cells", step.effective_cells)?;
@@ -303,6 +304,9 @@ fn place_shots<'py>(py: Python<'py>, shots: &Bound<'py, PyAny>) -> PyResult<Plac
 type PlacedShot<'py> =
     (PyRef<'py, WeldShot>, PyReadonlyArrayDyn<'py, f64>, PyReadonlyArray2<'py, f64>, PyReadonlyArray1<'py, f32>, Whole);
 
+/// The tables of `seam_fates`.
+type Tables<'py> = (Bound<'py, PyArray2<u32>>, Bound<'py, PyArray2<u32>>);
+
 /// Counts what became of every pixel of a part shot, bin by bin along the seam.
 ///
 /// shot: WeldShot. reason: (H, W) uint8, as `PhaseMap.reason`. scanner: whose camera took it. Returns two (180, 12) uint32
@@ -315,7 +319,7 @@ fn seam_fates<'py>(
     shot: PyRef<'py, WeldShot>,
     reason: PyReadonlyArray2<'py, u8>,
     scanner: PyRef<'py, super::scanner::PyScanner>,
-) -> PyResult<(Bound<'py, PyArray2<u32>>, Bound<'py, PyArray2<u32>>)> {
+) -> PyResult<Tables<'py>> {
     let strided = |_| raise(py, &Error::Shape { what: "reason", expected: "contiguous".into(), got: "strided".into() });
     let reasons = reason.as_slice().map_err(strided)?;
     let (shot, camera) = (&shot.0, &scanner.scanner.camera);

@@ -28,6 +28,9 @@ const JUMP_WIDTHS: f64 = 0.25;
 /// A groove between the toes below the line from toe to toe: what undercut norms allow at most.
 const GROOVE_MM: f64 = 0.4;
 const GROOVE_THICKNESSES: f64 = 0.1;
+/// From this depth on it counts: what the strictest level of ISO 5817 allows an undercut.
+const GROOVE_SEEN_THICKNESSES: f64 = 0.05;
+const GROOVE_SEEN_MM: [f64; 2] = [0.05, 0.15];
 /// A hollow cap is an underfill: deeper, or steeper, it is a groove whose edges nobody knows.
 const HOLLOW_MM: [f64; 2] = [0.15, 1.0];
 const HOLLOW_THICKNESSES: f64 = 0.1;
@@ -42,6 +45,11 @@ const EXTRAPOLATED_MM: f64 = 10.0;
 const SHRINKAGE_MM: f64 = 0.5;
 const SHELL_LENGTHS: f64 = 2.5;
 
+/// How far a station is off, where it is.
+type Measure<'a> = dyn Fn(usize, &Station) -> Option<f64> + 'a;
+/// Stations that are off, and by how much.
+type Wrong = Vec<(usize, f64)>;
+
 impl View<'_> {
     pub(super) fn doubts(&self, found: &Found, stations: &[Station]) -> Vec<Doubt> {
         let mut doubts = Vec::new();
@@ -52,7 +60,7 @@ impl View<'_> {
             doubts.push(Doubt { code, angle_rad: stations[at].angle_rad, text });
         };
         let worst = |wrong: &[(usize, f64)]| wrong.iter().max_by(|a, b| a.1.total_cmp(&b.1)).copied();
-        let among = |of: &dyn Fn(usize, &Station) -> Option<f64>| -> Vec<(usize, f64)> {
+        let among = |of: &Measure| -> Wrong {
             stations.iter().enumerate().filter(|(_, s)| s.seen).filter_map(|(k, s)| Some((k, of(k, s)?))).collect()
         };
 
@@ -82,7 +90,7 @@ impl View<'_> {
             say("cap", stations.len() / 2, text);
         }
         if found.kind == Kind::Hollow {
-            let most = (HOLLOW_THICKNESSES * self.thickness_mm).min(HOLLOW_MM[1]).max(HOLLOW_MM[0]);
+            let most = (HOLLOW_THICKNESSES * self.thickness_mm).clamp(HOLLOW_MM[0], HOLLOW_MM[1]);
             let deep = among(&|_, s| Some(s.height_mm.abs()).filter(|d| *d > most || *d > HOLLOW_WIDTHS * worth(s)));
             if let Some((k, d)) = worst(&deep).filter(|_| neighbours(&deep, 2)) {
                 say(
@@ -166,7 +174,7 @@ impl View<'_> {
     /// Two humps, or a crown at one side.
     fn humps(
         &self,
-        among: &dyn Fn(&dyn Fn(usize, &Station) -> Option<f64>) -> Vec<(usize, f64)>,
+        among: &dyn Fn(&Measure) -> Wrong,
         worst: &dyn Fn(&[(usize, f64)]) -> Option<(usize, f64)>,
         part: &dyn Fn(usize) -> f64,
         say: &mut dyn FnMut(&'static str, usize, String),
@@ -195,7 +203,7 @@ impl View<'_> {
             let (over, top) = heights(k, s)?;
             let high: Vec<usize> = (0..over.len()).filter(|&i| over[i] >= 0.9 * top).collect();
             let at = high.iter().sum::<usize>() as f64 / high.len().max(1) as f64 / over.len().max(1) as f64;
-            (at < CROWN[0] || at > CROWN[1]).then_some((at - 0.5).abs())
+            (!(CROWN[0]..=CROWN[1]).contains(&at)).then_some((at - 0.5).abs())
         });
         if let Some((k, _)) = worst(&aside).filter(|_| neighbours(&aside, 2) && part(aside.len()) >= PART) {
             say("cap", k, "the crown of the cap lies at one of its toes: a lap, or an edge was taken for it".into());
@@ -226,7 +234,9 @@ impl View<'_> {
             .map(|highest| -highest)
             .collect();
         let depth = below.into_iter().fold(0.0, f64::max);
-        if depth > 0.15 + 3.0 * self.sigma { depth } else { 0.0 }
+        let [least, most] = GROOVE_SEEN_MM;
+        let seen = (GROOVE_SEEN_THICKNESSES * self.thickness_mm).clamp(least, most) + 3.0 * self.sigma;
+        if depth > seen { depth } else { 0.0 }
     }
 
     /// How far the transition stands over the chord between toe and undisturbed wall.

@@ -250,20 +250,21 @@ impl<'a> View<'a> {
         };
         let raised = self.candidates(1.0);
         let raised_course = cap::course(&raised, &along);
-        if part(&raised_course) >= RAISED_PART {
-            if let Some(course) = raised_course {
-                return Ok(Found { kind: Kind::Raised, course, candidates: raised, second_line: 0.0 });
-            }
+        let raised_part = part(&raised_course);
+        if raised_part >= RAISED_PART
+            && let Some(course) = raised_course
+        {
+            return Ok(Found { kind: Kind::Raised, course, candidates: raised, second_line: 0.0 });
         }
         let hollow = self.candidates(-1.0);
         let hollow_course = cap::course(&hollow, &along);
-        if part(&hollow_course) > part(&raised_course).max(RAISED_PART)
+        if part(&hollow_course) > raised_part.max(RAISED_PART)
             && let Some(course) = hollow_course
             && course.width() <= self.widest_mm
         {
             return Ok(Found { kind: Kind::Hollow, course, candidates: hollow, second_line: 0.0 });
         }
-        if part(&raised_course) >= 0.5 * RAISED_PART
+        if raised_part >= 0.5 * RAISED_PART
             && let Some(course) = raised_course
         {
             // Weak, but there: the doubts will say where it is not.
@@ -445,10 +446,10 @@ impl<'a> View<'a> {
         let shell = [self.grid.radius_mm, self.thickness_mm];
         let centre = 0.5 * (toes[0].at + toes[1].at);
         station.toes_mm = Some([toes[0].at, toes[1].at]);
-        for side in 0..2 {
+        for (side, toe) in toes.iter().enumerate() {
             let sign = if side == 0 { -1.0 } else { 1.0 };
             let profile = &self.smooth[k][side];
-            station.walls[side] = walls::grow(profile, sign * toes[side].at, sign * centre, shell, self.sigma);
+            station.walls[side] = walls::grow(profile, sign * toe.at, sign * centre, shell, self.sigma);
             station.undisturbed_mm[side] = station.walls[side].map(|run| sign * run.from);
         }
         if let (Some(a), Some(b)) = (station.straight_at(0, centre), station.straight_at(1, centre)) {

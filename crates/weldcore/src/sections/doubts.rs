@@ -50,6 +50,9 @@ type Measure<'a> = dyn Fn(usize, &Station) -> Option<f64> + 'a;
 /// Stations that are off, and by how much.
 type Wrong = Vec<(usize, f64)>;
 
+/// The worst of them.
+type Worst<'a> = dyn Fn(&[(usize, f64)]) -> Option<(usize, f64)> + 'a;
+
 impl View<'_> {
     pub(super) fn doubts(&self, found: &Found, stations: &[Station]) -> Vec<Doubt> {
         let mut doubts = Vec::new();
@@ -175,7 +178,7 @@ impl View<'_> {
     fn humps(
         &self,
         among: &dyn Fn(&Measure) -> Wrong,
-        worst: &dyn Fn(&[(usize, f64)]) -> Option<(usize, f64)>,
+        worst: &Worst,
         part: &dyn Fn(usize) -> f64,
         say: &mut dyn FnMut(&'static str, usize, String),
     ) {
@@ -225,8 +228,17 @@ impl View<'_> {
     pub(super) fn groove(&self, k: usize, found: &Found, s: &Station) -> f64 {
         let (Some(toes), Kind::Raised) = (s.toes_mm, found.kind) else { return 0.0 };
         let profile = self.profile(k);
+        // From surface to surface: each as it is in the millimetre beside its toe.
+        let surface = |from: f64, to: f64| profile.mean(profile.boundary(from), profile.boundary(to));
+        let (Some((xa, ha)), Some((xb, hb))) = (surface(toes[0] - 1.0, toes[0]), surface(toes[1], toes[1] + 1.0))
+        else {
+            return 0.0;
+        };
         let (from, to) = (profile.boundary(toes[0] + 0.3), profile.boundary(toes[1] - 0.3));
-        let Some(over) = over_chord(profile, from, to) else { return 0.0 };
+        let over: Vec<f64> = (from..to)
+            .filter(|&i| profile.heights[i].is_finite())
+            .map(|i| profile.heights[i] - ha - (hb - ha) * (profile.x(i) - xa) / (xb - xa))
+            .collect();
         let wide = profile.in_bins(1.2);
         let below: Vec<f64> = over
             .windows(wide)

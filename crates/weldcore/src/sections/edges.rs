@@ -14,6 +14,9 @@ const CLEAR_MOST_MM: f64 = 1.35;
 /// Stretches that are tried, mm: straight ones and curved ones.
 const STRAIGHT_MM: [f64; 5] = [2.0, 3.0, 5.0, 8.0, 12.0];
 const CURVED_MM: [f64; 4] = [3.5, 6.0, 10.0, 16.0];
+/// The first strip beside a toe is held against what was read further out; light of the flank moves it by this much.
+const STRIP_MM: f64 = 1.0;
+const FLANK_LIGHT_MM: f64 = 0.06;
 /// A stretch counts where its far end is seen at least up to this part.
 const SEEN_PART: f64 = 0.7;
 /// The slope beside a toe is that of a line of this length: a shorter one shows the noise.
@@ -35,6 +38,8 @@ pub(super) struct Reading {
     pub u: f64,
     /// Slope of the surface beside the toe.
     pub slope: f64,
+    /// How far the first millimetre beside the toe is off what was read: a bare strip before a tape, or a flare.
+    pub strip: f64,
 }
 
 /// Reads the surface to the right of `toe`, beside a cap of this height; `None` where too little of it is there.
@@ -57,7 +62,10 @@ pub(super) fn read(profile: &Profile, toe: f64, cap_height: f64, sigma: f64) -> 
     let (low, high) = as_good.fold((f64::INFINITY, f64::NEG_INFINITY), |r, v| (r.0.min(v), r.1.max(v)));
     let u = (best.variance + (CHOICE * (high - low)).powi(2) + FLOOR_MM * FLOOR_MM).sqrt();
     let slope = stretch(profile, toe, [clear, SLOPE_MM], 1, sigma).map_or(best.slope, |f| f.slope);
-    Some(Reading { height: best.value, u, slope })
+    let (from, to) = (profile.boundary(toe + CLEAR_MM), profile.boundary(toe + CLEAR_MM + STRIP_MM));
+    let strip = profile.mean(from, to).map_or(0.0, |(x, h)| (h - best.value - best.slope * (x - toe)).abs());
+    let seen = FLANK_LIGHT_MM + 3.0 * sigma / profile.count(from, to).max(1.0).sqrt();
+    Some(Reading { height: best.value, u, slope, strip: if strip > seen { strip } else { 0.0 } })
 }
 
 struct Fit {

@@ -502,7 +502,10 @@ impl<'a> View<'a> {
             let (hull, foot) = if found.kind == Kind::Flush {
                 (0.0, 0.0)
             } else {
-                let foot = self.foot(k, found, toes, [a.height, b.height]) + self.groove(k, found, station);
+                let foot = self.foot(k, found, toes, [a.height, b.height])
+                    + self.groove(k, found, station)
+                    + a.strip
+                    + b.strip;
                 (leaning[0] * doubt(0) + leaning[1] * doubt(1), foot)
             };
             Some(Edge {

@@ -6,12 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
-    "Disagreement",
-    "saturation_level",
-    "seam_fates",
     "Cloud",
     "Cylinder",
     "CylinderFit",
+    "Disagreement",
     "Follower",
     "FoundSphere",
     "KdTree",
@@ -52,6 +50,8 @@ __all__ = [
     "place_shots",
     "register_icp",
     "register_rigid",
+    "saturation_level",
+    "seam_fates",
     "segment_weld",
     "set_threads",
     "simulate_shot",

@@ -49,7 +49,11 @@ def test_an_honest_session_keeps_its_pass(name):
     rows = zip(step.angle_deg.tolist(), step.edge_step_mm, step.edge_u_mm, strict=True)
     both = [(edge - seen[int(angle)], u) for angle, edge, u in rows if int(angle) in seen]
     errors, stated = np.array(both).T
-    assert len(errors) > 20 and np.sqrt(np.mean(errors**2)) < 0.03 and np.mean(np.abs(errors) <= stated) > 0.9
+    assert len(errors) > 20 and np.sqrt(np.mean(errors**2)) < 0.03 and np.mean(np.abs(errors) <= stated) > COVERED
+
+
+# U of the edges is a hull, not calibrated yet: it covers nine bins of ten at least.
+COVERED = 0.9
 
 
 class FromScene(PointReader):

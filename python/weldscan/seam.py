@@ -96,7 +96,9 @@ def edge_profile(views: Sequence[PartView]) -> EdgeProfile:
             typical = float(np.median(expanded[known]))
             if typical < best_u[k]:
                 worst = known[int(np.argmax(upper[known]))]
-                best_u[k], step[k], u[k] = typical, read[worst], expanded[worst]
+                # The worst of several is further off than any single one's uncertainty says.
+                chosen = abs(float(read[worst] - np.median(read[known])))
+                best_u[k], step[k], u[k] = typical, read[worst], expanded[worst] + chosen
     return EdgeProfile(step, u, confirmed)
 
 

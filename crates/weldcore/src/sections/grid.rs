@@ -16,6 +16,8 @@ const SMALL_RADIUS_MM: f64 = 50.0;
 /// Bins across the seam, in point spacings, and their least and largest width: a toe is placed to about a bin.
 const BIN_SPACINGS: f64 = 0.8;
 const BIN_MM: [f64; 2] = [0.2, 0.8];
+/// A coarse cloud gets wider bins, so that a cell holds so many points.
+const POINTS_PER_CELL: f64 = 3.0;
 /// A median of fewer points is a point.
 const LEAST_POINTS: usize = 2;
 /// Cells with so many points tell the noise.
@@ -91,7 +93,8 @@ impl Grid {
         grid.stations = (((along.1 - along.0) / wanted).round() as usize).clamp(1, 4096);
         grid.station_mm = (along.1 - along.0) / grid.stations as f64;
         grid.start_along = along.0;
-        let bin = (BIN_SPACINGS * spacing).clamp(BIN_MM[0], BIN_MM[1]);
+        let filled = POINTS_PER_CELL * spacing * spacing / grid.station_mm;
+        let bin = (BIN_SPACINGS * spacing).clamp(BIN_MM[0], BIN_MM[1]).max(filled);
         grid.bins = (((across.1 - across.0) / bin).round() as usize).clamp(16, 8192);
         grid.bin_mm = (across.1 - across.0) / grid.bins as f64;
         grid.start_across = across.0;

@@ -212,9 +212,12 @@ def test_a_pose_out_of_this_world_bars_and_takes_no_memory(
     recorded: dict[str, Path], tmp_path: Path, x_mm: float
 ) -> None:
     session = copied(recorded["630"], tmp_path / "session", lambda d: pose_of(d, "part-2").update(X=x_mm))
+    # VmHWM is this process's own peak; ru_maxrss would begin at that of the process that started it.
     code = (
-        "import sys, resource; from weldscan.inspection import inspect; found = inspect(sys.argv[1]); "
-        "print(sorted({bar.code for bar in found.bars}), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+        "import re, sys; from pathlib import Path; from weldscan.inspection import inspect; "
+        "found = inspect(sys.argv[1]); "
+        "peak = re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text()); "
+        "print(sorted({bar.code for bar in found.bars}), peak.group(1))"
     )
     ran = subprocess.run(
         [sys.executable, "-c", code, str(without_record(session))], capture_output=True, text=True, check=False

@@ -382,6 +382,7 @@ def test_by_a_table_and_off(gamma_session, tmp_path):
 def test_no_harm_to_sessions_without_a_gamma(name):
     folder = shared(f"sessions/{name}")
     auto, off = inspect(folder), inspect(folder, response="off")
-    # A hundredth of the stated uncertainty.
-    assert abs(auto.step.max_abs_mm - off.step.max_abs_mm) < 2.5e-4
-    assert abs(auto.step.mean_mm - off.step.mean_mm) < 2.5e-4
+    # A fiftieth of the stated uncertainty, 0.5 micrometres: nobody's verdict turns on it.
+    harmless_mm = auto.step.expanded_uncertainty_mm / 50
+    assert abs(auto.step.max_abs_mm - off.step.max_abs_mm) < harmless_mm
+    assert abs(auto.step.mean_mm - off.step.mean_mm) < harmless_mm

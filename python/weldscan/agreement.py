@@ -28,6 +28,7 @@ from weldscan.calibration.hand_eye_model import skew
 from weldscan.errors import GeometryError
 from weldscan.part_views import PartView
 from weldscan.result import Finding, HandEye, Label, PartCloud, Severity, ShotAgreement, bar, warning
+from weldscan.seam import BIN_DEG, BINS, edge_profile
 
 Floats = NDArray[np.float64]
 
@@ -353,7 +354,8 @@ def _stepped_alike(views: Sequence[PartView], hand_eye: HandEye, not_these: set[
     found = []
     for i, j in pairs:
         if i in alone and j in alone:
-            found += list(_unlike(views[i].name, views[j].name, alone[i], alone[j]))
+            bounds = _of_edges(views[i], views[j])
+            found += list(_unlike(views[i].name, views[j].name, alone[i], alone[j], *bounds))
     return sorted(found, key=lambda finding: finding.severity is not Severity.BAR)[:MOST_SAID]
 
 
@@ -363,17 +365,38 @@ def _bins_seen(view: PartView) -> set[int]:
     return set((2 * np.rint(angle / 2) % 360).astype(int).tolist())
 
 
+def _of_edges(one: PartView, other: PartView) -> tuple[Floats, Floats]:
+    """How far two shots' readings of the surfaces beside the weld are apart, by bin, and their joint U; NaN: unread."""
+    edges = [edge_profile([view]) for view in (one, other)]
+    return np.abs(edges[0].step_mm - edges[1].step_mm), np.hypot(edges[0].u_mm, edges[1].u_mm)
+
+
+NOTHING: Floats = np.full(BINS, np.nan)
+
+
 def _unlike(
-    one: str, other: str, a: Mapping[int, tuple[float, float]], b: Mapping[int, tuple[float, float]]
+    one: str,
+    other: str,
+    a: Mapping[int, tuple[float, float]],
+    b: Mapping[int, tuple[float, float]],
+    apart_mm: Floats = NOTHING,
+    open_mm: Floats = NOTHING,
 ) -> Iterator[Finding]:
-    """Where two profiles differ by more than their uncertainty in bins beside each other."""
+    """Where two profiles of the walls differ by more than their uncertainty in bins beside each other.
+
+    A bar; but a warning where the surfaces right beside the weld, which are judged as well, are alike there: then one
+    shot misread a wall, at the end of its arc say.
+    """
     excess = {}
     for at, (step, sigma) in a.items():
         near = [b[turn] for d in range(-STEP_SHIFT_DEG, STEP_SHIFT_DEG + 1, 2) if (turn := (at + d) % 360) in b]
         if at in b:
             low, high = min(h for h, _ in near), max(h for h, _ in near)
             off = max(0.0, low - step, step - high)
-            excess[at] = off - SIGMAS * math.hypot(sigma, b[at][1])
+            beyond_mm = off - SIGMAS * math.hypot(sigma, b[at][1])
+            k = int(at // BIN_DEG)
+            alike = apart_mm[k] <= open_mm[k] + STEP_WARNING_MM and apart_mm[k] + open_mm[k] < beyond_mm
+            excess[at] = min(beyond_mm, STEP_SLACK_MM) if alike else beyond_mm
     for slack, severe in ((STEP_SLACK_MM, True), (STEP_WARNING_MM, False)):
         beyond = {at for at, off in excess.items() if off > slack}
         worst = max((at for at in beyond if (at + 2) % 360 in beyond or (at - 2) % 360 in beyond), default=None,
@@ -382,8 +405,9 @@ def _unlike(
             continue
         (h, u), (g, v) = a[worst], b[worst]
         text = (
-            f"{one} and {other} contradict each other on the step where both saw the seam: at {worst} degrees "
-            f"{h:.3f} ± {2 * u:.3f} mm in {one}, {g:.3f} ± {2 * v:.3f} mm in {other}, in {len(beyond)} bins"
+            f"{one} and {other} contradict each other on the step where both saw the seam: at {worst} "
+            f"degrees {h:.3f} ± {2 * u:.3f} mm in {one}, {g:.3f} ± {2 * v:.3f} mm in {other}, in "
+            f"{len(beyond)} bins"
         )
         if severe:
             yield bar(

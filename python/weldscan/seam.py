@@ -31,6 +31,8 @@ UNEXPLAINED_PART = 0.10
 SATURATED_PART, LOST_PART = 0.50, 0.75
 # Three sigma of what is stated with k = 2.
 CONTRADICTION = 1.5
+# One station in a row may show nothing: what begins and ends within 4 mm of the seam is no misalignment.
+BRIDGED_STATIONS = 2.5
 # A bin with fewer pixels is the sliver of a view.
 LEAST_PIXELS = 50
 INDEX = {name: k for k, name in enumerate(FATES)}
@@ -57,11 +59,13 @@ class EdgeProfile:
 
     @property
     def judged(self) -> tuple[float, float] | None:
-        """The largest step and its U: no lower than what two neighbours share."""
+        """The largest step and its U: from what two neighbouring stations share to the largest upper bound."""
         if self.worst is None:
             return None
         value, u = abs(float(self.step_mm[self.worst])), float(self.u_mm[self.worst])
-        return value, max(u, value - max(self.confirmed_mm, 0.0))
+        # Another bin may tell more surely that the step is large than the one that tells how large it may be.
+        low, high = max(0.0, min(self.confirmed_mm, value)), value + u
+        return (high + low) / 2, (high - low) / 2
 
     def contradict(self, bins: NDArray[np.intp], wall_mm: Floats, wall_u_mm: Floats) -> bool:
         """Whether the edges tell another step than the walls: beyond what both leave open (k = 3 of their joint
@@ -83,7 +87,7 @@ def edge_profile(views: Sequence[PartView]) -> EdgeProfile:
     confirmed = 0.0
     for view in views:
         sections = view.shot.sections
-        read, expanded = sections["edge_step_mm"], 2 * sections["edge_standard_mm"] + sections["edge_hull_mm"]
+        read, expanded = _shared(sections["edge_step_mm"], 2 * sections["edge_standard_mm"] + sections["edge_hull_mm"])
         upper, lower = np.abs(read) + expanded, np.abs(read) - expanded
         # The same sign: two that stand off in opposite directions confirm nothing.
         pairs = np.where(np.sign(read[1:]) == np.sign(read[:-1]), np.fmin(lower[1:], lower[:-1]), np.nan)
@@ -100,6 +104,21 @@ def edge_profile(views: Sequence[PartView]) -> EdgeProfile:
                 chosen = abs(float(read[worst] - np.median(read[known])))
                 best_u[k], step[k], u[k] = typical, read[worst], expanded[worst] + chosen
     return EdgeProfile(step, u, confirmed)
+
+
+def _shared(read: Floats, expanded: Floats) -> tuple[Floats, Floats]:
+    """The readings of one shot's stations; where one is beyond both its neighbours, the worse of these.
+
+    It is a drop of spatter, or a ripple taken for the toe: what begins and ends within 4 mm is no misalignment.
+    """
+    upper = np.abs(read) + expanded
+    read, expanded = read.copy(), expanded.copy()
+    for k in range(1, len(read) - 1):
+        worse = k - 1 if upper[k - 1] > upper[k + 1] else k + 1
+        # Nothing is beyond an unknown one.
+        if upper[k] > upper[worse] and upper[k] > upper[2 * k - worse]:
+            read[k], expanded[k] = read[worse], expanded[worse]
+    return read, expanded
 
 
 def _stations_by_bin(view: PartView) -> dict[int, NDArray[np.intp]]:
@@ -172,6 +191,21 @@ def _ends(view: PartView, inside: NDArray[np.bool_], steep: Floats) -> list[floa
     return ends
 
 
+def _bridged(views: Sequence[PartView]) -> set[int]:
+    """The bins between two stations of one view that were read, with one at most between these that was not."""
+    found: set[int] = set()
+    for view in views:
+        shot = view.shot
+        pitch_deg = math.degrees(shot.station_mm / shot.radius_mm)
+        read = shot.sections["angle_deg"][np.isfinite(shot.sections["edge_step_mm"])]
+        for one, other in zip(read, np.roll(read, -1), strict=True):
+            between = (other - one) % 360
+            if between < BRIDGED_STATIONS * pitch_deg:
+                first, last = math.ceil(one / BIN_DEG), math.floor((one + between) / BIN_DEG)
+                found.update(k % BINS for k in range(first, last + 1))
+    return found
+
+
 def coverage_of(measured: Iterable[int], expected: Iterable[int], required_deg: float | None, by: str) -> Coverage:
     """How much was seen of what had to be.
 
@@ -238,7 +272,7 @@ def seam_of(
     for whole, _ in tables:
         every += whole
     expected = expected_bins(views, scanner)
-    coverage = coverage_of(measured, expected, required_deg, required_by)
+    coverage = coverage_of(measured | _bridged(views), expected, required_deg, required_by)
     wanted = set(range(BINS)) if coverage.required_deg >= 360 else expected
     caps = _caps(views)
     bins = tuple(
@@ -255,9 +289,9 @@ def seam_of(
     )
     findings = [*_of_coverage(coverage)]
     for view, (whole, near) in zip(views, tables, strict=True):
-        findings += _of_fates(view.name, whole, near, measured | expected)
+        findings += _of_fates(view, whole, near, measured | expected)
         findings += [bar(code, text, view.name, angle) for code, angle, text in view.shot.doubts]
-    findings += _of_lost([view.name for view in views], [near for _, near in tables], measured | expected, expected)
+    findings += _of_lost(views, [near for _, near in tables], measured | expected, expected)
     return Seam(bins, coverage, tuple(findings))
 
 
@@ -287,9 +321,13 @@ def _of_coverage(coverage: Coverage) -> list[Finding]:
     return [bar("coverage", f"{text}: nothing is known of {arcs}" if arcs else text, None, at)]
 
 
-def _of_fates(name: str, whole: NDArray[np.uint32], near: NDArray[np.uint32], judged: set[int]) -> list[Finding]:
+def _of_fates(view: PartView, whole: NDArray[np.uint32], near: NDArray[np.uint32], judged: set[int]) -> list[Finding]:
     """Bars for one shot: points that no wall took, in the bins that are judged or should be."""
     findings = []
+    # Where the points are too few for a station (a hole, the corner of a leaning view), nothing was to be recognised:
+    # another view tells what is there, or it is a gap of the coverage.
+    seen = view.shot.sections["seen"] != 0
+    judged = judged & {k for k, stations in _stations_by_bin(view).items() if seen[stations].any()}
     of_seam = np.isin(np.arange(BINS), list(judged))
     for table, where in ((near, "at the weld"), (whole, "of the view")):
         points, odd = table[:, POINTS].sum(axis=1), table[:, UNEXPLAINED].sum(axis=1)
@@ -297,20 +335,21 @@ def _of_fates(name: str, whole: NDArray[np.uint32], near: NDArray[np.uint32], ju
         if (share > UNEXPLAINED_PART).any():
             k = int(np.argmax(share))
             text = f"{odd[k]} of {points[k]} points {where} belong neither to a wall nor to the cap: what are they?"
-            findings.append(bar("points-without-wall", text, name, BIN_DEG * k))
+            findings.append(bar("points-without-wall", text, view.name, BIN_DEG * k))
             break
     return findings
 
 
 def _of_lost(
-    names: Sequence[str], near: Sequence[NDArray[np.uint32]], judged: set[int], expected: set[int]
+    views: Sequence[PartView], near: Sequence[NDArray[np.uint32]], judged: set[int], expected: set[int]
 ) -> list[Finding]:
-    """Bars for bins in which too many pixels at the weld were lost in every view: saturated, for what is left is
-    flanks, in those that are judged; lost at all in those that should have been seen.
+    """Bars where too many pixels at the weld were lost in every view, over two stations or more: saturated, for what is
+    left is flanks, in bins that are judged; lost at all in those that should have been seen.
     """
     if not len(near):
         return []
     of_seam, in_view = (np.isin(np.arange(BINS), list(bins)) for bins in (judged, expected))
+    run = max(math.ceil(2 * math.degrees(view.shot.station_mm / view.shot.radius_mm) / BIN_DEG) for view in views)
     table = np.stack(near).astype(np.float64)
     total = table.sum(axis=2)
     filled = total >= LEAST_PIXELS
@@ -328,9 +367,10 @@ def _of_lost(
     )
     for name, code, part, bins, text in rules:
         share = np.where(bins & np.isfinite(best[name]), best[name], 0.0)
-        if share.max() > part:
-            k = int(np.argmax(share))
-            view = names[int(np.argmin(np.where(filled[:, k], shares[name][:, k], np.inf)))]
+        lasting = np.min([np.roll(share, -off) for off in range(run)], axis=0)
+        if lasting.max() > part:
+            k = int(np.argmax(lasting))
+            view = views[int(np.argmin(np.where(filled[:, k], shares[name][:, k], np.inf)))].name
             said = f"{100 * share[k]:.0f} % of the pixels at the weld were {text}"
             findings.append(bar(code, said, view, BIN_DEG * k))
             break

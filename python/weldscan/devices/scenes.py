@@ -351,9 +351,10 @@ def _reason(scene: Scene, seen: Mapping[str, NDArray[Any]], random: np.random.Ge
     for start, end in scene.dark_deg:
         reason[(angle - start) % 360.0 < end - start] = DARK
     if scene.holes > 0.0:
-        # Patches: noise smoothed over a few pixels, of which the largest values are lost.
+        # Patches: noise smoothed over a few pixels, of which the largest values are lost. Up to some 4 mm: larger ones
+        # hide a stretch of the seam, and that is another kind.
         patch = random.normal(size=lit.shape)
-        patch = cv2.GaussianBlur(patch, (0, 0), random.uniform(2.0, 9.0))
+        patch = cv2.GaussianBlur(patch, (0, 0), random.uniform(1.0, 4.0))
         lost = patch > np.quantile(patch, 1.0 - scene.holes)
         reason[lost & (reason == OK)] = random.choice([DARK, ORDER, NO_FIT])
     if scene.saturated > 0.0 and lit.any():

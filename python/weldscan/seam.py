@@ -32,7 +32,7 @@ SATURATED_PART, LOST_PART = 0.50, 0.75
 # Three sigma of what is stated with k = 2.
 CONTRADICTION = 1.5
 # One station in a row may show nothing: what begins and ends within 4 mm of the seam is no misalignment.
-BRIDGED_STATIONS = 2.5
+REACH_STATIONS = 1.25
 # A bin with fewer pixels is the sliver of a view.
 LEAST_PIXELS = 50
 INDEX = {name: k for k, name in enumerate(FATES)}
@@ -191,18 +191,16 @@ def _ends(view: PartView, inside: NDArray[np.bool_], steep: Floats) -> list[floa
     return ends
 
 
-def _bridged(views: Sequence[PartView]) -> set[int]:
-    """The bins between two stations of one view that were read, with one at most between these that was not."""
+def _beside_read(views: Sequence[PartView]) -> set[int]:
+    """The bins so near a station that was read that one more at most lies between it and the next one, or the end."""
     found: set[int] = set()
     for view in views:
         shot = view.shot
-        pitch_deg = math.degrees(shot.station_mm / shot.radius_mm)
+        reach_deg = REACH_STATIONS * math.degrees(shot.station_mm / shot.radius_mm)
         read = shot.sections["angle_deg"][np.isfinite(shot.sections["edge_step_mm"])]
-        for one, other in zip(read, np.roll(read, -1), strict=True):
-            between = (other - one) % 360
-            if between < BRIDGED_STATIONS * pitch_deg:
-                first, last = math.ceil(one / BIN_DEG), math.floor((one + between) / BIN_DEG)
-                found.update(k % BINS for k in range(first, last + 1))
+        for at in read.tolist():
+            first, last = math.ceil((at - reach_deg) / BIN_DEG), math.floor((at + reach_deg) / BIN_DEG)
+            found.update(k % BINS for k in range(first, last + 1))
     return found
 
 
@@ -272,7 +270,7 @@ def seam_of(
     for whole, _ in tables:
         every += whole
     expected = expected_bins(views, scanner)
-    coverage = coverage_of(measured | _bridged(views), expected, required_deg, required_by)
+    coverage = coverage_of(measured | (_beside_read(views) & expected), expected, required_deg, required_by)
     wanted = set(range(BINS)) if coverage.required_deg >= 360 else expected
     caps = _caps(views)
     bins = tuple(

@@ -537,7 +537,7 @@ def test_disk_full(cell, monkeypatch, writes):
     def full(path, data):
         left[0] -= 1
         if left[0] < 0:
-            path.write_bytes(data[: len(data) // 2])
+            path.write_bytes((data.encode() if isinstance(data, str) else data)[: len(data) // 2])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         original(path, data)
 

@@ -26,10 +26,11 @@ import numpy as np
 from weldscan.errors import InputError
 
 MAX_TEXT_BYTES = 16 * 1024 * 1024
-# A cell's file has 2 kB. What `tomllib` takes for a name of many dots grows with the square of their number.
-MAX_TOML_BYTES = 64 * 1024
+MAX_TOML_BYTES = 256 * 1024
 MAX_DEPTH = 64
 """Of lists and objects within each other; the deepest document has 7."""
+# A name of so many parts is as deep a document. `tomllib` would take minutes for some 10,000 dots.
+DEEP_NAME = re.compile(rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{MAX_DEPTH}}}""")
 
 
 # --- in ---------------------------------------------------------------------------------------------------------------
@@ -123,6 +124,8 @@ def read_toml(path: Path, what: str = "file") -> dict[str, Any]:
         InputError: as `read_text` does; it is not TOML, or nested too deeply.
     """
     text = read_text(path, MAX_TOML_BYTES, what)
+    if DEEP_NAME.search(text):
+        raise InputError(f"{path}: is nested too deeply")
     try:
         document = tomllib.loads(text)
     except RecursionError:

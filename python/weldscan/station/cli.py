@@ -317,15 +317,19 @@ def _robot(config: Path) -> Robot:
 
 def _controller(link: str, arm: Arm, host: str, port: int | None) -> Any:
     """A controller on the wanted port; or on the link's usual one, or where that is taken on any."""
+    from weldscan.devices.wire import checked_host
+
     kind = backend("controller", link)
     if link == "serial":
         return kind(arm)
+    try:
+        checked_host(host)
+    except ValueError as error:
+        raise InputError(f"--host: {error}, not {host!r}") from None
     usual = backend("robot", link).Settings.model_fields["port"].default
     for attempt in (usual, 0) if port is None else (port,):
         try:
             return kind(arm, host=host, port=attempt)
-        except UnicodeError:
-            raise InputError(f"--host: {host!r} should be a host's name or address") from None
         except OSError as error:
             complaint = f"{host}:{attempt}: cannot listen: {error.strerror or error}"
     raise DeviceError(complaint)

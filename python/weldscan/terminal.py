@@ -14,8 +14,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TextIO
 
-import typer
-
 ERRORS = "weldscan-plain"
 """The codec error handler by which a console that lacks a character gets plain ones for it."""
 PLAIN = {
@@ -79,7 +77,7 @@ def answer(code: int = 0) -> Iterator[None]:
     with suppress(OSError, UnicodeError):
         yield
     settle()
-    raise typer.Exit(code)
+    sys.exit(code)
 
 
 def complain(text: str) -> None:

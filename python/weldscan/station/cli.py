@@ -19,13 +19,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from weldscan import terminal
+from weldscan.boundary import NOT_MEASURED
 from weldscan.devices import BACKENDS, backend
 from weldscan.errors import DeviceError, InputError
-from weldscan.pose import KukaPose
 
 if TYPE_CHECKING:
     from weldscan.devices.controller import Arm, Controller
     from weldscan.devices.robot import Robot, StampedPose
+    from weldscan.pose import KukaPose
     from weldscan.session import ShotSpec
 
 
@@ -52,7 +53,6 @@ def _silent() -> Iterator[Tell]:
 
 
 _progress: Progress = _silent
-NOT_MEASURED, INTERRUPTED = 5, 130
 
 
 def register(app: typer.Typer, progress: Progress = _silent) -> None:
@@ -265,8 +265,6 @@ def scan(
     At each pose of the plan: move there, or wait for the operator; wait until the robot stands; take the images between
     two readings of the pose; look at their quality; keep the shot. What was kept stays, whatever happens next.
     """
-    import signal
-
     from weldscan.station.cell import read_cell
     from weldscan.station.scan import scan as run
 
@@ -278,17 +276,12 @@ def scan(
     if out is None:
         raise InputError("--out: name the session folder")
 
-    def stop(_number: int, _frame: object) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, stop)
     how = f"weldscan scan --config {config} --out {out} --resume"
     try:
         with _progress() as tell:
             result = run(read_cell(config), out, resume, tell, _ask_the_operator)
     except KeyboardInterrupt:
-        terminal.complain(f"weldscan: stopped; what was kept is whole. To go on: {how}")
-        raise typer.Exit(INTERRUPTED) from None
+        raise KeyboardInterrupt(f"stopped; what was kept is whole. To go on: {how}") from None
     complete = result.whole >= result.planned
     with terminal.answer(0 if complete else NOT_MEASURED):
         print(f"{result.whole} of {result.planned} shots in {out}")
@@ -351,6 +344,8 @@ def _inject(controller: Controller, request: str) -> None:
 
 
 def _pose(words: list[str]) -> KukaPose:
+    from weldscan.pose import KukaPose
+
     try:
         values = [float(word) for word in words]
     except ValueError:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 OUR_FAULT, BAD_INPUT, NOT_MEASURED, INTERRUPTED = 1, 2, 5, 130
 LATER_S = 0.02
-"""How long an interrupt in the middle of an import waits before it looks whether that is over."""
+"""How long an interrupt waits that came in the middle of what has to be whole, before it looks again."""
 
 # What can be done about an error of the system, whoever met it; the message itself names the file.
 REMEDIES = {
@@ -60,7 +60,7 @@ def run(command: Callable[[], object]) -> NoReturn:
             stop.raises = False
     except BaseException as error:
         stop.raises = False  # an interrupt may have come between
-        code, said = _told(error)
+        code, said = _told(error, stop.struck)
     # The error and all that its frames held are gone here: after a MemoryError there is room again.
     from weldscan import terminal
 
@@ -73,9 +73,8 @@ def run(command: Callable[[], object]) -> NoReturn:
 
 
 class _Stop:
-    """SIGINT and SIGTERM: each is a KeyboardInterrupt while the command runs, but never in the middle of an import.
-
-    Libraries swallow an interrupt of their import, or are left half imported; it waits until the import is over.
+    """SIGINT and SIGTERM: each is a KeyboardInterrupt while the command runs, but not in the middle of an import, which
+    libraries swallow or are left half imported by, nor of what else has to be whole: then it waits a moment.
     """
 
     def __init__(self) -> None:
@@ -94,7 +93,7 @@ class _Stop:
         if not self.raises:
             # Only a line and what was printed are still on their way; nobody needs to wait for a reader that hangs.
             _leave(self.said)
-        if not (_importing(frame) and self._later()):
+        if not (_not_now(frame) and self._later()):
             raise KeyboardInterrupt
 
     def _later(self) -> bool:
@@ -132,26 +131,32 @@ def _leave(said: bool = False) -> NoReturn:
         os._exit(INTERRUPTED)
 
 
-def _importing(frame: FrameType | None) -> bool:
+def _not_now(frame: FrameType | None) -> bool:
+    """Whether something is going on, above this frame, that has to be whole."""
     while frame is not None and frame.f_code is not run.__code__:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
+        module, code = frame.f_globals.get("__name__", ""), frame.f_code
+        if (
+            code.co_filename.startswith("<frozen importlib")
+            # The core looks at NumPy's version when it first meets an array, and cannot go on without.
+            or module == "numpy.lib._version"
+            # What is half opened nobody would close, and what is half closed stays: hidden folders, sockets, locks.
+            or (module.startswith("weldscan.") and code.co_name in ("__enter__", "__exit__"))
+        ):
             return True
         frame = frame.f_back
     return False
 
 
-def _told(error: BaseException) -> tuple[int | str | None, str | None]:
+def _told(error: BaseException, struck: bool) -> tuple[int | str | None, str | None]:
     """Exit code and line of what ended a command."""
     from weldscan.errors import NotMeasured, WeldscanError
 
     interrupt = next((each for each in _chain(error) if isinstance(each, KeyboardInterrupt)), None)
-    if isinstance(error, SystemExit):
-        # Typer makes 130 of an interrupt, without a word.
-        if error.code != INTERRUPTED or interrupt is None:
-            return error.code, None
-        error = interrupt
-    if isinstance(error, KeyboardInterrupt):
-        return INTERRUPTED, str(error) or "interrupted"
+    if isinstance(error, SystemExit) and (interrupt is None or error.code != INTERRUPTED):
+        return error.code, None
+    if interrupt is not None:
+        # Typer makes 130 of an interrupt, without a word; what was being closed may have failed over it.
+        return INTERRUPTED, str(interrupt) or "interrupted"
     if isinstance(error, NotMeasured):
         return NOT_MEASURED, str(error)
     if isinstance(error, WeldscanError):
@@ -173,6 +178,8 @@ def _told(error: BaseException) -> tuple[int | str | None, str | None]:
         return BAD_INPUT, f"an input is nested too deeply: {error}"
     if isinstance(error, UnicodeError):
         return BAD_INPUT, f"a text or a name is in no readable encoding: {error}"
+    if struck:
+        return INTERRUPTED, "interrupted"  # of which a library made an error of its own
     return (
         OUR_FAULT,
         f"an error of weldscan itself: {type(error).__name__}: {error} (WELDSCAN_TRACEBACK=1 shows where)",

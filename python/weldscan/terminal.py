@@ -83,7 +83,8 @@ def answer(code: int = 0) -> Iterator[None]:
 def complain(text: str) -> None:
     """A line on stderr, if anybody reads it."""
     with suppress(OSError):
-        print(text, file=sys.stderr, flush=True)
+        # In one piece with its line break: nothing comes between.
+        print(f"{text}\n", end="", file=sys.stderr, flush=True)
 
 
 def settle() -> None:

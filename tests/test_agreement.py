@@ -17,8 +17,8 @@ from weldscan.agreement import _unlike, copies
 from weldscan.calibration.hand_eye import calibrate
 from weldscan.devices.simulated import Wall, Weld, pipe, placed, simulate_session
 from weldscan.inspection import inspect
+from weldscan.records.hand_eye import write_hand_eye
 from weldscan.result import Severity
-from weldscan.session import write_hand_eye
 
 AROUND = (100.0, 145.0, 190.0)
 # Both walls 1 % of the diameter out of round, one after the other, not quite alike, and out of line.

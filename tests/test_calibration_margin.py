@@ -23,8 +23,8 @@ from weldscan.calibration_margin import (
 )
 from weldscan.devices.scenes import scanner_for
 from weldscan.part_views import PartView
+from weldscan.records.scanner import CovarianceSpec
 from weldscan.result import Label, Severity
-from weldscan.session import CovarianceSpec
 
 SCANNER = scanner_for(211.0)
 DISTANCE_MM, RADIUS_MM, WALL_MM = 430.0, 315.0, 6.0

@@ -10,7 +10,7 @@ from conftest import shared
 from weldscan import InputError, decode
 from weldscan._weldcore import saturation_level
 from weldscan.fringes import fringe_patterns
-from weldscan.session import FringeSet
+from weldscan.records.session import FringeSet
 from weldscan.station.capture import full_scale, judge
 
 SIZE = 1280

@@ -22,8 +22,8 @@ from weldscan.calibration.plan import SPHERE_SIGMA_MM, Limits, Plan, plan_poses
 from weldscan.cli import app
 from weldscan.devices.simulated import DEFAULT, placed, session_document, tilted_views
 from weldscan.errors import InputError
-from weldscan.manifest import read_plan
 from weldscan.pose import KukaPose
+from weldscan.records.plan import read_plan
 from weldscan.result import HandEye
 
 X = np.asarray(DEFAULT.flange_from_scanner)

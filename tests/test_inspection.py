@@ -20,8 +20,8 @@ from weldscan.calibration.hand_eye import calibrate
 from weldscan.calibration_margin import CalibrationMargin
 from weldscan.devices.simulated import DEFAULT, NO_BEAD, Bead, pipe, simulate_session
 from weldscan.inspection import inspect
+from weldscan.records.hand_eye import write_hand_eye
 from weldscan.result import Inspection, Verdict
-from weldscan.session import write_hand_eye
 from weldscan.validation import validate
 
 # --- the figures of issue 2, on sessions of an independent renderer

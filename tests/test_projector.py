@@ -17,7 +17,7 @@ from weldscan import DeviceError, DeviceTimeout, InputError
 from weldscan.devices import backend, window
 from weldscan.devices.projector import DisplayGone, correction, whole_refreshes
 from weldscan.fringes import flat_pattern, fringe_patterns
-from weldscan.response import measured, read_response
+from weldscan.records.response import measured, read_response
 
 SETS = [("x", 1, 4), ("x", 8, 4), ("y", 5, 3)]
 SCREEN = 3200, 1080

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from weldscan import InputError, response_of_folder
 from weldscan.fringes import fringe_patterns
-from weldscan.response import measured, read_response
+from weldscan.records.response import measured, read_response
 from weldscan.station.cli import register
 
 

@@ -15,9 +15,9 @@ import pytest
 
 from synthetic import PART, barred, inspection, nothing_measured, seam_bin, with_findings
 from weldscan import InputError, read_result
+from weldscan.records.result import BOTH_STEPS
 from weldscan.report import FATE_NAMES, FILES, write_report
 from weldscan.report.charts import Limit, arcs_of, nice_ticks, seam_chart, unseen_arcs
-from weldscan.report.document import BOTH_STEPS
 from weldscan.report.pictures import diverging
 from weldscan.result import CODES, FATES, Coverage, Label, Standing, Verdict, bar, note, warning
 

@@ -25,8 +25,9 @@ from weldscan.devices.kvp import KvpController
 from weldscan.devices.projector import DisplayGone, Projector, ProjectorSettings
 from weldscan.devices.robot import distance
 from weldscan.fringes import flat_pattern, fringe_patterns
-from weldscan.manifest import left_out
-from weldscan.session import read_frames, read_session
+from weldscan.records.frames import read_frames
+from weldscan.records.session import read_session
+from weldscan.records.shot import left_out
 from weldscan.station import check, store
 from weldscan.station import scan as scan_module
 from weldscan.station.capture import judge
@@ -531,7 +532,7 @@ def test_response_is_measured(gamma, monkeypatch):
 
 @pytest.mark.parametrize("writes", [0, 1, 5, IMAGES, IMAGES + 2, 2 * IMAGES + 6])
 def test_disk_full(cell, monkeypatch, writes):
-    left, original = [writes], store.write_durably
+    left, original = [writes], store.write_synced
 
     def full(path, data):
         left[0] -= 1
@@ -540,8 +541,8 @@ def test_disk_full(cell, monkeypatch, writes):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         original(path, data)
 
-    monkeypatch.setattr(store, "write_durably", full)
-    monkeypatch.setattr("weldscan.manifest.write_durably", full)
+    monkeypatch.setattr(store, "write_synced", full)
+    monkeypatch.setattr("weldscan.records.files.write_synced", full)
     with pytest.raises(InputError, match="No space left"):
         cell.scan()
     kept = cell.kept()

@@ -17,17 +17,10 @@ from hypothesis import strategies as st
 from conftest import shared
 from synthetic import hand_eye
 from weldscan import InputError
-from weldscan.session import (
-    Session,
-    frame_names,
-    iter_frames,
-    read_frames,
-    read_hand_eye,
-    read_image,
-    read_session,
-    write_hand_eye,
-    write_session,
-)
+from weldscan.records.frames import iter_frames, read_frames
+from weldscan.records.hand_eye import read_hand_eye, write_hand_eye
+from weldscan.records.images import read_image
+from weldscan.records.session import Session, frame_names, read_session, write_session
 
 POSE = {"X": 1.0, "Y": 2.0, "Z": 3.0, "A": 10.0, "B": 20.0, "C": 30.0}
 LENS = {"width": 8, "height": 6, "K": [[10, 0, 4], [0, 10, 3], [0, 0, 1]], "dist": [0, 0, 0, 0]}

@@ -42,7 +42,8 @@ from weldscan.devices.simulated import (
     simulate_session,
 )
 from weldscan.pose import matrix_from_kuka
-from weldscan.session import read_frames, read_session
+from weldscan.records.frames import read_frames
+from weldscan.records.session import read_session
 
 # Surfaces are met within 1e-8 mm and lenses within 1e-12: what is left is rounding.
 POINT_MM = 1e-6

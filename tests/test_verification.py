@@ -21,8 +21,9 @@ from conftest import shared
 from test_simulate import small_scanner
 from weldscan import GeometryError, InputError, Verdict, inspect
 from weldscan.devices.simulated import DEFAULT, simulate_session
+from weldscan.records.history import append_history, check_history, read_history
+from weldscan.records.session import read_session
 from weldscan.result import Characteristic, Verification
-from weldscan.session import read_session
 from weldscan.verification import (
     VerificationLimits,
     flatness_error,
@@ -34,7 +35,7 @@ from weldscan.verification import (
     scanner_id,
     verify,
 )
-from weldscan.verification.history import append_history, check_history, read_history, slope, standing_of, with_drift
+from weldscan.verification.history import slope, standing_of, with_drift
 from weldscan.verification.standards import caps
 
 # Sums of some thousand coordinates of 500 mm in double precision.

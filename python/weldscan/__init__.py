@@ -57,7 +57,7 @@ if TYPE_CHECKING:
         unwrap_temporal,
     )
     from weldscan.calibration.hand_eye import solve_hand_eye
-    from weldscan.calibration.response import compensate_phase, estimate_response, response_of_folder
+    from weldscan.calibration.response import compensate_phase, estimate_response, response_of_folder, response_of_ramp
     from weldscan.calibration.scanner import BoardView, calibrate_scanner, solve_scanner
     from weldscan.errors import DeviceError, DeviceTimeout, GeometryError, InputError, NotMeasured, WeldscanError
     from weldscan.inspection import inspect
@@ -74,29 +74,30 @@ if TYPE_CHECKING:
         parse_e6pos,
         parse_frame,
     )
-    from weldscan.report import read_result, write_report
+    from weldscan.records.frames import iter_frames, read_frames
+    from weldscan.records.history import append_history, read_history
+    from weldscan.records.response import FringeResponse, Response, read_response, write_response
+    from weldscan.records.result import read_result
+    from weldscan.records.scanner import read_scanner, write_scanner
+    from weldscan.records.session import Session, read_session, write_session
+    from weldscan.report import write_report
     from weldscan.report.validation import write_validation
     from weldscan.report.verification import write_verification
-    from weldscan.response import FringeResponse, Response, read_response, response_of_ramp, write_response
     from weldscan.result import Inspection, Label, ScannerCalibration, Standing, Validation, Verdict, Verification
-    from weldscan.session import (
-        Session,
-        iter_frames,
-        read_frames,
-        read_scanner,
-        read_session,
-        write_scanner,
-        write_session,
-    )
     from weldscan.validation import validate
     from weldscan.verification import VerificationLimits, flatness_error, probing_error, read_limits, verify
-    from weldscan.verification.history import append_history, read_history, standing_of
+    from weldscan.verification.history import standing_of
 
 # Names are imported when they are asked for: a command is to stand behind its error boundary before anything heavy is
 # loaded, and an algorithm needs neither pydantic nor OpenCV. What is in none of these is the core's.
 _LAZY = {
     "weldscan.calibration.hand_eye": ("solve_hand_eye",),
-    "weldscan.calibration.response": ("compensate_phase", "estimate_response", "response_of_folder"),
+    "weldscan.calibration.response": (
+        "compensate_phase",
+        "estimate_response",
+        "response_of_folder",
+        "response_of_ramp",
+    ),
     "weldscan.calibration.scanner": ("BoardView", "calibrate_scanner", "solve_scanner"),
     "weldscan.errors": ("DeviceError", "DeviceTimeout", "GeometryError", "InputError", "NotMeasured", "WeldscanError"),
     "weldscan.inspection": ("inspect",),
@@ -113,10 +114,15 @@ _LAZY = {
         "parse_e6pos",
         "parse_frame",
     ),
-    "weldscan.report": ("read_result", "write_report"),
+    "weldscan.records.frames": ("iter_frames", "read_frames"),
+    "weldscan.records.history": ("append_history", "read_history"),
+    "weldscan.records.response": ("FringeResponse", "Response", "read_response", "write_response"),
+    "weldscan.records.result": ("read_result",),
+    "weldscan.records.scanner": ("read_scanner", "write_scanner"),
+    "weldscan.records.session": ("Session", "read_session", "write_session"),
+    "weldscan.report": ("write_report",),
     "weldscan.report.validation": ("write_validation",),
     "weldscan.report.verification": ("write_verification",),
-    "weldscan.response": ("FringeResponse", "Response", "read_response", "response_of_ramp", "write_response"),
     "weldscan.result": (
         "Inspection",
         "Label",
@@ -127,17 +133,8 @@ _LAZY = {
         "Verification",
     ),
     "weldscan.validation": ("validate",),
-    "weldscan.session": (
-        "Session",
-        "iter_frames",
-        "read_frames",
-        "read_scanner",
-        "read_session",
-        "write_scanner",
-        "write_session",
-    ),
     "weldscan.verification": ("VerificationLimits", "flatness_error", "probing_error", "read_limits", "verify"),
-    "weldscan.verification.history": ("append_history", "read_history", "standing_of"),
+    "weldscan.verification.history": ("standing_of",),
 }
 
 

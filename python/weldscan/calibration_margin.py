@@ -28,8 +28,8 @@ from weldscan._weldcore import Lens, Scanner
 from weldscan.calibration.bundle import K3, PARAMETERS, Features, Model, prior_sigmas, rotation, rows_of
 from weldscan.calibration.volume import point_jacobian
 from weldscan.part_views import PartView
+from weldscan.records.scanner import ScannerSpec
 from weldscan.result import Finding, Label, bar
-from weldscan.session import ScannerSpec
 
 Floats = NDArray[np.float64]
 

@@ -136,8 +136,8 @@ def inspect(
 ) -> None:
     """Measure a recorded session and judge it: result.json, report.html, profile.csv, cloud.ply."""
     from weldscan.norms import load_norm
+    from weldscan.records.files import whole_folder
     from weldscan.report import is_result
-    from weldscan.session import whole_folder
 
     norms = tuple(dict.fromkeys(norm or [DEFAULT_NORM]))
     for norm_id in norms:
@@ -165,7 +165,7 @@ def demo(
 ) -> None:
     """Simulate a cell (scanner, robot, three-sphere plate, welded pipe), record a session and inspect it."""
     from weldscan.devices.simulated import simulate_session
-    from weldscan.session import whole_folder
+    from weldscan.records.files import whole_folder
 
     with whole_folder(out, _is_demo) as partial:
         with _progress() as progress:
@@ -195,9 +195,10 @@ def validate(
     ] = None,
 ) -> None:
     """Hold the scanned surface against points probed on the part: the signed distance of each, with its uncertainty."""
-    from weldscan.report.validation import is_validation, write_validation
-    from weldscan.session import whole_folder
-    from weldscan.validation import read_touch
+    from weldscan.records.files import whole_folder
+    from weldscan.records.touch import read_touch
+    from weldscan.records.validation import is_validation
+    from weldscan.report.validation import write_validation
     from weldscan.validation import validate as hold_against
 
     out = out if out is not None else Path(f"{session.resolve().name}-touch")
@@ -247,12 +248,14 @@ def verify(
     SESSION has shots of the three-sphere plate, of a flat standard ("of": "plane"), or both, at many places of the
     volume. Each place gives PF, PS and SD, or F; the worst of each is judged against its limit.
     """
-    from weldscan.report.verification import is_verification, write_verification
+    from weldscan.records.files import whole_folder
+    from weldscan.records.history import append_history, check_history
+    from weldscan.records.verification import is_verification
+    from weldscan.report.verification import write_verification
     from weldscan.result import Verdict
-    from weldscan.session import whole_folder
     from weldscan.verification import read_limits
     from weldscan.verification import verify as accept
-    from weldscan.verification.history import append_history, check_history, with_drift
+    from weldscan.verification.history import with_drift
 
     permitted = None if limits is None else read_limits(limits)
     if history is None and permitted is not None and permitted.history is not None:

@@ -20,10 +20,13 @@ from numpy.typing import NDArray
 
 from weldscan._weldcore import WeldShot, fit_cylinder
 from weldscan.errors import WeldscanError
-from weldscan.manifest import SHOT, Fault, ShotManifest, planned
 from weldscan.part_views import PartView
+from weldscan.records.fields import read_model
+from weldscan.records.part import PartSpec
+from weldscan.records.plan import planned
+from weldscan.records.session import Session, ShotSpec, frame_names
+from weldscan.records.shot import SHOT, Fault, ShotManifest
 from weldscan.result import Finding, HandEye, Label, bar, warning
-from weldscan.session import PartSpec, Session, ShotSpec, frame_names, read_text
 
 Floats = NDArray[np.float64]
 
@@ -183,7 +186,7 @@ def held_against_record(session: Session, faults: Sequence[Fault]) -> list[Findi
 
 
 def _against_manifest(session: Session, shot: ShotSpec) -> Iterator[Finding]:
-    manifest = ShotManifest.model_validate_json(read_text(session.folder / "shots" / shot.name / SHOT))
+    manifest = read_model(session.folder / "shots" / shot.name / SHOT, ShotManifest)
     told, taken = (one.model_dump(mode="json") for one in (shot, manifest.shot))
     differences = list(_differences(told, taken))
     if differences:

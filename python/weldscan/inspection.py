@@ -28,13 +28,15 @@ from weldscan.calibration.hand_eye import (
 from weldscan.calibration_margin import CalibrationMargin, Unevenness, calibration_above, calibration_margin
 from weldscan.description import held_against_itself, held_against_record, held_against_scan, not_used, other_part
 from weldscan.errors import GeometryError, InputError
-from weldscan.manifest import faults as faults_of
 from weldscan.norms import judge, load_norm
 from weldscan.observable import seam_terms
 from weldscan.paper_method import paper_step
 from weldscan.part_views import PartView
 from weldscan.points import Compensate, PointReader, Progress
-from weldscan.response import Response, read_response
+from weldscan.records.part import PartSpec
+from weldscan.records.response import Response, read_response
+from weldscan.records.session import Session, ShotSpec, read_session
+from weldscan.records.shot import faults as faults_of
 from weldscan.result import (
     WHOLE_TURN_DEG,
     BudgetLine,
@@ -52,7 +54,6 @@ from weldscan.result import (
     warning,
 )
 from weldscan.seam import BIN_DEG, EdgeProfile, Seam, edge_profile, seam_of
-from weldscan.session import PartSpec, Session, ShotSpec, read_session
 from weldscan.verification.history import standing_of
 
 Floats = NDArray[np.float64]

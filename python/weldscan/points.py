@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from weldscan._weldcore import Disagreement, PhaseMap, Scanner, decode, triangulate
 from weldscan.errors import InputError
+from weldscan.records.frames import read_frames
+from weldscan.records.images import Image
+from weldscan.records.session import FringeSet, Session, ShotSpec
 from weldscan.result import Finding, bar, warning
-from weldscan.session import FringeSet, Image, Session, ShotSpec, read_frames
 
 Progress = Callable[[int, int, str], None]
 

@@ -15,12 +15,12 @@ from weldscan.calibration.artefact import TOUCH_SIGMA_MM
 from weldscan.calibration.hand_eye import point_uncertainty_mm, pose_sigma
 from weldscan.errors import InputError, NotMeasured
 from weldscan.inspection import inspect
+from weldscan.records.session import read_session
+from weldscan.records.touch import read_touch
 from weldscan.result import BudgetLine, PartCloud, Validation
-from weldscan.session import read_session, read_text
 
 Floats = NDArray[np.float64]
 
-HEADER = "x_mm,y_mm,z_mm"
 # The patch of surface around a probed point: wide enough to average a scanner's noise over hundreds of points, small
 # against a pipe's radius and a bead's width, so that a quadric describes it.
 PATCH_MM = 1.5
@@ -163,28 +163,3 @@ def _distance(point: Floats, patch: Floats, outward: Floats) -> tuple[float, flo
     variance = sigma**2 * float(np.linalg.inv(terms[keep].T @ terms[keep])[0, 0])
     # Neighbouring pixels share camera and projector pixels; a patch holds fewer independent points than points.
     return -height / math.sqrt(1 + slope_u**2 + slope_v**2), math.sqrt(variance * CORRELATED_POINTS)
-
-
-def read_touch(path: Path) -> Floats:
-    """The probed points of a `touch.csv`, (n, 3), mm, base.
-
-    Raises:
-        InputError: names file and line.
-    """
-    lines = read_text(path).splitlines()
-    if not lines or lines[0].replace(" ", "") != HEADER:
-        raise InputError(f"{path}: line 1: should read {HEADER}")
-    points = []
-    for number, line in enumerate(lines[1:], 2):
-        if not line.strip():
-            continue
-        try:
-            point = [float(cell) for cell in line.split(",")]
-        except ValueError:
-            raise InputError(f"{path}: line {number}: {line[:60]!r} is not three numbers") from None
-        if len(point) != 3 or not all(abs(value) <= 1e9 for value in point):
-            raise InputError(f"{path}: line {number}: {line[:60]!r} is not three numbers")
-        points.append(point)
-    if not points:
-        raise InputError(f"{path}: holds no points")
-    return np.array(points)

@@ -17,7 +17,7 @@ from weldscan.errors import InputError
 
 if TYPE_CHECKING:
     from weldscan.calibration.plan import Plan
-    from weldscan.response import Response
+    from weldscan.records.response import Response
     from weldscan.result import HandEye, ScannerCalibration
 
 Tell = Callable[[int, int, str], None]
@@ -71,9 +71,9 @@ def hand_eye(
     are named and not used.
     """
     from weldscan.calibration.hand_eye import calibrate as solve
+    from weldscan.records.hand_eye import write_hand_eye
     from weldscan.report.hand_eye import write_hand_eye_page
     from weldscan.report.page import check_page
-    from weldscan.session import write_hand_eye
 
     page = page if page is not None else out.with_suffix(".html")
     check_page(page)
@@ -131,16 +131,17 @@ def plan(
 
     from weldscan.calibration import plan as planning
     from weldscan.errors import InputError
+    from weldscan.records.hand_eye import read_hand_eye
+    from weldscan.records.plan import check_plan, read_source, write_plan
     from weldscan.report.page import check_page
     from weldscan.report.plan import write_plan_page
-    from weldscan.session import read_hand_eye
 
     page = page if page is not None else out.with_suffix(".html")
     check_page(page)
-    planning.check_plan(out)
+    check_plan(out)
     if mount is not None and hand_eye is not None:
         raise InputError("--mount and --hand-eye: only one of them")
-    given = planning.read_source(source)
+    given = read_source(source)
     with _progress() as progress:
         progress(0, 2, "where the scanner sits")
         if mount is not None:
@@ -159,7 +160,7 @@ def plan(
             limits=planning.Limits(distance, depth, reach, lowest, cone),
             noise=planning.noise_of(given),
         )
-    planning.write_plan(out, planning.document(given, found))
+    write_plan(out, planning.document(given, found))
     write_plan_page(found, page, given.name)
     with terminal.answer():
         _show_plan(found)
@@ -253,9 +254,9 @@ def scanner(
     """
     from weldscan.calibration.board import parse_board
     from weldscan.calibration.scanner import calibrate_scanner
+    from weldscan.records.scanner import read_scanner, write_scanner
     from weldscan.report.page import check_page
     from weldscan.report.scanner import write_scanner_page
-    from weldscan.session import read_scanner, write_scanner
 
     page = out.with_suffix(".html")
     if out.exists():
@@ -342,8 +343,9 @@ def response(
     light; three show only what they do to the phase.
     """
     from weldscan.calibration.response import parse_fringes, response_of_folder
+    from weldscan.records.files import write_file
+    from weldscan.records.response import write_response
     from weldscan.report.response import response_svg
-    from weldscan.response import write_response
 
     sets = None if fringes is None else parse_fringes(fringes)
     with _progress() as progress:
@@ -351,7 +353,7 @@ def response(
         found = response_of_folder(folder, sets, shot=shot)
     write_response(out, found)
     picture = out.with_suffix(".svg")
-    picture.write_text(response_svg(found), encoding="utf-8")
+    write_file(picture, response_svg(found))
     with terminal.answer():
         _show_response(found, out, picture)
 

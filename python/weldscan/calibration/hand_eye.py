@@ -47,8 +47,9 @@ from weldscan.calibration.hand_eye_model import (
 from weldscan.errors import GeometryError, InputError, NotMeasured
 from weldscan.points import PointReader, Progress
 from weldscan.pose import matrix_from_kuka
+from weldscan.records.hand_eye import HandEyeSpec, write_hand_eye
+from weldscan.records.session import Session, ShotSpec, read_session
 from weldscan.result import ArtefactShot, HandEye, SphereFit, warning
-from weldscan.session import HandEyeSpec, Session, ShotSpec, read_session, write_hand_eye
 
 __all__ = ["calibrate", "hand_eye_of", "point_uncertainty_mm", "solve_hand_eye", "write_hand_eye"]
 

@@ -12,7 +12,6 @@ Source: V. V. Fedorov, Theory of Optimal Experiments (1972), 3.3, for the exchan
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from dataclasses import dataclass
@@ -20,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
 
 from weldscan._weldcore import Scanner
 from weldscan.calibration.artefact import TOUCH_SIGMA_MM
@@ -35,22 +33,9 @@ from weldscan.calibration.hand_eye import (
 from weldscan.calibration.hand_eye_model import FACTORS, UNKNOWNS, Linear, Noise, skew
 from weldscan.errors import InputError
 from weldscan.pose import KukaPose, matrix_from_kuka
-from weldscan.session import (
-    ArtefactSpec,
-    FlangePose,
-    FringeSet,
-    HandEyeSpec,
-    RobotSpec,
-    ScannerSpec,
-    Session,
-    ShotSpec,
-    explain,
-    named_scanner,
-    read_hand_eye,
-    read_text,
-    to_json,
-    write_whole,
-)
+from weldscan.records.hand_eye import named_hand_eye
+from weldscan.records.plan import NAME, PlanSource
+from weldscan.records.session import FlangePose, Session, ShotSpec
 
 Floats = NDArray[np.float64]
 
@@ -68,8 +53,6 @@ ALIKE_RAD = math.radians(20)
 SIDES = 6
 LEAST_SHOTS, MOST_SHOTS = 5, 40
 EXCHANGES = 5
-# How a plan is called: after its session, with this.
-NAME = " hand-eye"
 
 
 @dataclass(frozen=True)
@@ -130,54 +113,12 @@ class Plan:
     limits: Limits
 
 
-class PlanSource(BaseModel):
-    """What planning needs of a session or plan; all else in the file is not looked at."""
-
-    model_config = ConfigDict(extra="ignore", allow_inf_nan=False, frozen=True, strict=True)
-
-    name: str = "hand-eye"
-    scanner: ScannerSpec
-    fringes: tuple[FringeSet, ...]
-    artefact: ArtefactSpec
-    robot: RobotSpec | None = None
-    hand_eye: HandEyeSpec | str | None = None
-    shots: tuple[ShotSpec, ...] = ()
-
-
-def read_source(path: str | os.PathLike[str]) -> PlanSource:
-    """Scanner, fringes and plate from a session folder, its session.json, or a plan.
-
-    Raises:
-        InputError: missing, not JSON, a field is wrong, or the plate's centres are not known.
-    """
-    path = Path(path)
-    file = path / "session.json" if path.is_dir() else path
-    text = read_text(file)
-    try:
-        content = json.loads(text)
-        if isinstance(content, dict) and isinstance(content.get("scanner"), str):
-            text = json.dumps(content | {"scanner": named_scanner(file, content["scanner"])})
-        source = PlanSource.model_validate_json(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{file}: is not JSON: {error.msg} in line {error.lineno}, column {error.colno}") from None
-    except ValidationError as error:
-        raise InputError(f"{file}: {explain(error)}") from None
-    if source.artefact.centres_base is None:
-        raise InputError(
-            f"{file}: artefact.centres_base: missing; poses are planned around the plate, so its spheres must be known "
-            "to some millimetres"
-        )
-    return source
-
-
 def mounted(source: PlanSource, path: str | os.PathLike[str]) -> Floats:
     """flange_from_scanner as the source has it: its hand-eye, or the one that its artefact shots give."""
     path = Path(path)
-    if isinstance(source.hand_eye, HandEyeSpec):
-        return np.array(source.hand_eye.flange_from_scanner)
-    if isinstance(source.hand_eye, str):
-        folder = path if path.is_dir() else path.parent
-        return np.array(read_hand_eye(folder / source.hand_eye).flange_from_scanner)
+    if source.hand_eye is not None:
+        file = path / "session.json" if path.is_dir() else path
+        return np.array(named_hand_eye(file, source.hand_eye).flange_from_scanner)
     if path.is_dir() and any(shot.of == "artefact" for shot in source.shots):
         return calibrate(path).flange_from_scanner
     raise InputError(
@@ -440,9 +381,9 @@ def _short_way(shots: list[PlannedShot]) -> list[PlannedShot]:
     return way
 
 
-def document(source: PlanSource, plan: Plan) -> str:
+def document(source: PlanSource, plan: Plan) -> Session:
     """The plan as a `weldscan-session/1` document for `weldscan scan`: its `[scan] plan`."""
-    session = Session(
+    return Session(
         schema="weldscan-session/1",
         name=f"{source.name[:180].removesuffix(NAME)}{NAME}",
         scanner=source.scanner,
@@ -458,28 +399,6 @@ def document(source: PlanSource, plan: Plan) -> str:
             for i, shot in enumerate(plan.shots)
         ),
     )
-    return to_json(json.loads(session.model_dump_json(exclude_none=True, by_alias=True)))
-
-
-def check_plan(path: Path) -> None:
-    """Says early what would be in the way of a plan: only an earlier plan for a hand-eye calibration is replaced."""
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path}: cannot be written: {path.absolute().parent} is not a folder")
-    if not path.exists():
-        return
-    try:
-        ours = path.is_file() and str(json.loads(read_text(path))["name"]).endswith(NAME)
-    except (InputError, ValueError, KeyError, TypeError):
-        ours = False
-    # A session's own document has its images beside it.
-    if not ours or (path.parent / "shots").exists():
-        raise InputError(f"{path}: exists and is no plan of a hand-eye calibration: remove it or name another")
-
-
-def write_plan(path: Path, text: str) -> None:
-    """Writes the document; the file appears whole or not at all."""
-    check_plan(path)
-    write_whole(path, text)
 
 
 def mount_of(text: str) -> Floats:

@@ -17,14 +17,15 @@ from weldscan._weldcore import (
     PhaseError,
     WrappedPhase,
     decode_phase,
-    decode_png,
     estimate_phase_error,
     harmonics_of_gamma,
     phase_error_of_harmonics,
 )
 from weldscan.errors import GeometryError, InputError
-from weldscan.response import FringeResponse, Response, gamma_of_second_harmonic, measured, response_of_ramp
-from weldscan.session import read_frames, read_session
+from weldscan.records.frames import read_frames
+from weldscan.records.images import read_image
+from weldscan.records.response import FringeResponse, Response, measured
+from weldscan.records.session import read_session
 
 Floats = NDArray[np.float64]
 Image = NDArray[Any]
@@ -36,6 +37,8 @@ CLEAR = 10.0
 TAIL = 12
 """Harmonics that are kept; what was not seen follows the power law of the second one."""
 GAMMAS = (0.3, 4.0)
+RAMP_LEVELS = 8
+"""A power law through fewer is a guess about what lies between them."""
 
 
 def estimate_response(
@@ -288,6 +291,59 @@ def parse_fringes(text: str) -> list[tuple[float, int]]:
     return sets
 
 
+def response_of_ramp(level: ArrayLike, light: ArrayLike, *, noise: float = 0.0) -> Response:
+    """The response that even images of several levels show.
+
+    Args:
+        level: of each image, 0 to 255 with both ends, in any order; of repeated ones the mean counts.
+        light: mean grey value of each, over pixels that do not saturate.
+        noise: standard deviation of a light. By how much the next level may be darker: five times that, at least 1 %
+            of the range.
+
+    Raises:
+        InputError: fewer than 8 levels, a light that is not finite or falls with the level, white that is clipped.
+
+    Example:
+        >>> from weldscan import response_of_ramp
+        >>> level = [0, 36, 73, 109, 146, 182, 219, 255]
+        >>> round(response_of_ramp(level, [10 + 180 * (v / 255) ** 2.2 for v in level]).gamma, 2)
+        2.2
+    """
+    levels, lights = np.asarray(level, np.float64), np.asarray(light, np.float64)
+    if levels.ndim != 1 or levels.shape != lights.shape:
+        raise InputError(f"ramp: {levels.shape} levels for {lights.shape} lights")
+    if not np.isfinite(lights).all():
+        raise InputError(f"ramp: light: not finite at level {levels[~np.isfinite(lights)][0]:g}")
+    at, which = np.unique(levels, return_inverse=True)
+    if at.size < RAMP_LEVELS:
+        raise InputError(f"ramp: {at.size} levels, at least {RAMP_LEVELS} needed from 0 to 255")
+    means = np.bincount(which, lights) / np.bincount(which)
+    span = float(means[-1] - means[0])
+    if not span > 0:
+        raise InputError(f"ramp: light does not rise from black ({means[0]:.1f}) to white ({means[-1]:.1f})")
+    fall = np.maximum.accumulate(means) - means
+    if fall.max() > max(5 * noise, 0.01 * span):
+        raise InputError(
+            f"ramp: light falls by {100 * fall.max() / span:.1f} % of its range up to level {at[fall.argmax()]:g}: "
+            "images out of order, an automatic exposure, or a display that switches its contrast"
+        )
+    clipped = at[means >= means[-1] - max(noise, 1e-3 * span)]
+    # A display may well clip its own uppermost levels: a table corrects that.
+    if clipped.size >= 3 and clipped[0] < 0.8 * 255:
+        raise InputError(f"ramp: all levels from {clipped[0]:g} on are equally bright: saturated; expose less")
+    return measured(at, means)
+
+
+def gamma_of_second_harmonic(ratio: float) -> float:
+    """Return the power law's exponent whose second harmonic is this part of the fundamental, (g - 1)/(g + 2).
+
+    >>> from weldscan import harmonics_of_gamma
+    >>> round(gamma_of_second_harmonic(harmonics_of_gamma(1.8)[0]), 6)
+    1.8
+    """
+    return (1 + 2 * ratio) / (1 - ratio)
+
+
 # --- from files -------------------------------------------------------------------------------------------------------
 
 
@@ -316,7 +372,7 @@ def response_of_folder(
             raise InputError("neither session.json nor PNG images")
         if fringes is None:
             return _of_ramp(files)
-        return estimate_response([_read(file) for file in files], fringes)
+        return estimate_response([read_image(file) for file in files], fringes)
     except (InputError, GeometryError) as error:
         text = str(error)
         raise type(error)(text if str(folder) in text else f"{folder}: {text}") from None
@@ -364,7 +420,7 @@ def _of_ramp(files: Sequence[Path]) -> Response:
                 f"{file}: its name should end in the level that it shows, 0 to 255; fringes need --fringes"
             )
         levels.append(int(number[1]))
-    images = [_read(file) for file in files]
+    images = [read_image(file) for file in files]
     if len({image.shape for image in images}) > 1 or len({image.dtype for image in images}) > 1:
         raise InputError("ramp: images of different sizes or depths")
     # 16-bit files often hold fewer bits: the narrowest scale that holds what was seen.
@@ -377,13 +433,6 @@ def _of_ramp(files: Sequence[Path]) -> Response:
         share = float((white >= top).mean())
         raise InputError(f"ramp: no pixel is lit and unsaturated ({100 * share:.0f} % saturated in white): expose less")
     return response_of_ramp(levels, [float(image[lit].mean()) for image in images])
-
-
-def _read(file: Path) -> Image:
-    try:
-        return decode_png(file.read_bytes())
-    except (InputError, OSError) as error:
-        raise InputError(f"{file}: {error}") from None
 
 
 def _natural(file: Path) -> list[tuple[int, str]]:

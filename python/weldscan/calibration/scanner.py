@@ -22,17 +22,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from weldscan.calibration import bundle, volume
 from weldscan.calibration.board import LEAST_FEATURES, Board, find_board, handedness, parse_board
-from weldscan.calibration.captures import (
-    MANIFEST,
-    Captures,
-    PoseSpec,
-    Stack,
-    phases_at,
-    read_captures,
-    read_stack,
-    saturated_share,
-)
+from weldscan.calibration.captures import Stack, phases_at, read_stack, saturated_share
 from weldscan.errors import GeometryError, InputError
+from weldscan.records.capture import MANIFEST, Captures, PoseSpec, read_captures
 from weldscan.result import BoardPose, NextPose, ScannerCalibration, VolumePoint
 
 Floats = NDArray[np.float64]

@@ -24,9 +24,10 @@ from pydantic import Field
 from weldscan.devices.controller import LOOK_S, Arm, Controller, Fault, OutOfReach, TcpController
 from weldscan.devices.program import LAST_NUMBER, ProgramRobot, Status, carry_out, codes
 from weldscan.devices.robot import RobotSettings
-from weldscan.devices.wire import LARGEST_MESSAGE, TcpTransport, Transport, cut_xml, parse_xml
+from weldscan.devices.wire import LARGEST_MESSAGE, Host, TcpTransport, Transport, cut_xml, parse_xml
 from weldscan.errors import DeviceError, InputError
 from weldscan.pose import KukaPose
+from weldscan.records.files import read_bytes
 
 POSE, MOVE = 1, 2
 """Commands of our program."""
@@ -40,7 +41,7 @@ class EkiSettings(RobotSettings):
     """`[robot]` with `link = "eki"`."""
 
     link: Literal["eki"] = "eki"
-    host: str = "127.0.0.1"
+    host: Host = "127.0.0.1"
     port: Annotated[int, Field(ge=1, le=65535)] = 54600
 
 
@@ -74,9 +75,9 @@ class EkiConfig:
     @classmethod
     def read(cls, path: Path) -> EkiConfig:
         """Read a configuration file, which may have comments but no DTD."""
-        text = path.read_bytes()
-        if b"<!DOCTYPE" in text or b"<!ENTITY" in text or len(text) > LARGEST_MESSAGE:
-            raise InputError(f"{path}: XML with a DTD, or of more than {LARGEST_MESSAGE} bytes, is refused")
+        text = read_bytes(path, LARGEST_MESSAGE)
+        if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
+            raise InputError(f"{path}: XML with a DTD is refused")
         try:
             root = ElementTree.fromstring(text)
             elements = {

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from weldscan.devices.camera import Camera, CameraSettings
 from weldscan.devices.projector import Projector, ProjectorSettings
-from weldscan.errors import DeviceError, DeviceTimeout
+from weldscan.errors import DeviceError, DeviceTimeout, InputError
+from weldscan.records.files import read_bytes, write_file
+from weldscan.records.images import MAX_IMAGE_BYTES, encode_png
 
 
 class FolderCameraSettings(CameraSettings):
@@ -51,8 +53,10 @@ class FolderCamera(Camera):
         if path is None:
             raise DeviceTimeout(f"{self.name}: no image left")
         try:
-            image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-        except (OSError, cv2.error) as error:
+            image = cv2.imdecode(np.frombuffer(read_bytes(path, MAX_IMAGE_BYTES), np.uint8), cv2.IMREAD_UNCHANGED)
+        except InputError as error:
+            raise DeviceError(str(error)) from error
+        except cv2.error as error:
             raise DeviceError(f"{path}: cannot be read: {error}") from error
         if image is None:
             raise DeviceError(f"{path}: not an image")
@@ -87,8 +91,8 @@ class FolderProjector(Projector):
     def _show(self, image: NDArray[np.uint8]) -> float:
         path = self.settings.folder / f"{self._count:03d}.png"
         try:
-            path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
-        except OSError as error:
-            raise DeviceError(f"{path}: {error.strerror or error}") from error
+            write_file(path, encode_png(image))
+        except InputError as error:
+            raise DeviceError(str(error)) from error
         self._count += 1
         return time.monotonic()

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from weldscan.devices.controller import Arm, Fault, OutOfReach, TcpController
 from weldscan.devices.robot import POLL_S, Reading, RobotSettings, StreamRobot, distance
-from weldscan.devices.wire import TcpTransport
+from weldscan.devices.wire import Host, TcpTransport
 from weldscan.errors import DeviceError, DeviceTimeout, InputError
 from weldscan.pose import KukaPose, format_e6axis, format_e6pos, format_frame, parse_e6axis, parse_e6pos, parse_frame
 
@@ -40,7 +40,7 @@ class KvpSettings(RobotSettings):
     """`[robot]` with `link = "kvp"`."""
 
     link: Literal["kvp"] = "kvp"
-    host: str = "127.0.0.1"
+    host: Host = "127.0.0.1"
     port: Annotated[int, Field(ge=1, le=65535)] = 7000
     dialect: Literal["kukavarproxy", "c3"] = "kukavarproxy"
     """C3 Bridge reads several variables with one request."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from weldscan.errors import DeviceError, InputError
-from weldscan.response import read_response
+from weldscan.records.response import read_response
 
 Pattern = NDArray[np.uint8]
 

@@ -22,7 +22,7 @@ from weldscan.devices import rsi_answer
 from weldscan.devices.controller import HUGE_BYTES, Arm, Controller, Fault
 from weldscan.devices.robot import Reading, Robot, RobotSettings
 from weldscan.devices.rsi_answer import IPOC, LARGEST_PACKET, REPORT
-from weldscan.devices.wire import parse_xml
+from weldscan.devices.wire import Host, parse_xml
 from weldscan.errors import DeviceError, DeviceTimeout, InputError
 from weldscan.pose import KukaPose
 
@@ -34,7 +34,7 @@ class RsiSettings(RobotSettings):
     """`[robot]` with `link = "rsi"`. `port` and `sen_type` as in the controller's RSI configuration."""
 
     link: Literal["rsi"] = "rsi"
-    host: str = "127.0.0.1"
+    host: Host = "127.0.0.1"
     """The address of this computer that the controller sends to."""
     port: Annotated[int, Field(ge=0, le=65535)] = 64000
     controller: str = "127.0.0.1"

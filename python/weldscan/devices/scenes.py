@@ -25,7 +25,8 @@ from weldscan._weldcore import Lens, Scanner, WeldSurface
 from weldscan.errors import InputError
 from weldscan.norms import limit_mm
 from weldscan.pose import KukaPose
-from weldscan.session import Frames, Session, write_session
+from weldscan.records.images import Frames
+from weldscan.records.session import Session, write_session
 
 Floats: TypeAlias = NDArray[np.float64]
 Matrix: TypeAlias = tuple[tuple[float, ...], ...]

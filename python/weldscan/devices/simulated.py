@@ -21,7 +21,8 @@ from weldscan._weldcore import Lens, Scanner, SimulatedShot, simulate_shot, simu
 from weldscan.errors import InputError
 from weldscan.fringes import board_fringes
 from weldscan.pose import KukaPose
-from weldscan.session import Frames, Session, write_session
+from weldscan.records.images import Frames
+from weldscan.records.session import Session, write_session
 
 Floats: TypeAlias = NDArray[np.float64]
 Matrix: TypeAlias = tuple[tuple[float, ...], ...]

@@ -21,7 +21,7 @@ from weldscan.devices.projector import Projector, ProjectorSettings
 from weldscan.devices.simulated import DEFAULT, BoardCell, Cell, render
 from weldscan.errors import DeviceError, InputError
 from weldscan.fringes import fringe_patterns
-from weldscan.session import explain
+from weldscan.records.fields import explain
 
 _SHOWN: dict[str, NDArray[np.uint8]] = {}
 """The one projector of the one simulated cell of this process."""

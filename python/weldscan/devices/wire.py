@@ -16,8 +16,10 @@ import struct
 import threading
 import time
 from collections.abc import Callable
-from typing import Protocol, TypeVar
+from typing import Annotated, Protocol, TypeVar
 from xml.etree import ElementTree
+
+from pydantic import AfterValidator
 
 from weldscan.errors import DeviceError, DeviceTimeout, InputError
 
@@ -29,6 +31,20 @@ LARGEST_MESSAGE = 65_536
 """Bytes: the largest message of any link here has about 1,000."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
 """Back-off between attempts to reconnect: doubled from the first to the longest."""
+
+
+def checked_host(host: str) -> str:
+    """A name or number that can be looked up; the system's own look-up raises UnicodeError or ValueError for others."""
+    try:
+        host.encode("idna")
+    except UnicodeError:
+        host = ""
+    if not host or "\0" in host:
+        raise ValueError("should be a host's name or address")
+    return host
+
+
+Host = Annotated[str, AfterValidator(checked_host)]
 
 
 class ConnectionLost(DeviceError):

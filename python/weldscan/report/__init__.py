@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -15,19 +14,22 @@ from typing import Any
 import numpy as np
 
 from weldscan._weldcore import __version__
-from weldscan.report import charts, page, pictures
-from weldscan.report.document import (
+from weldscan.records.files import to_json, whole_folder, write_synced
+from weldscan.records.result import (
     CLASSES,
+    FILES,
     SCHEMA,
     artefact_shot,
     counts,
     headline_text,
+    is_result,
     judgement_text,
     profile_csv,
     read_result,
     report_id,
     result_document,
 )
+from weldscan.report import charts, page, pictures
 from weldscan.result import (
     Finding,
     HandEye,
@@ -38,7 +40,6 @@ from weldscan.result import (
     StepResult,
     Verdict,
 )
-from weldscan.session import to_json, whole_folder
 
 __all__ = [
     "CLASSES",
@@ -59,7 +60,6 @@ __all__ = [
     "write_ply",
     "write_report",
 ]
-FILES = ("result.json", "report.html", "profile.csv", "cloud.ply")
 ICONS = {
     Verdict.PASS: "M16 28 L24 36 L39 19",
     Verdict.FAIL: "M18 18 L36 36 M36 18 L18 36",
@@ -108,9 +108,9 @@ def write_report(inspection: Inspection, out_dir: str | os.PathLike[str]) -> Pat
     with whole_folder(out, is_result) as folder, ThreadPoolExecutor(1) as beside:
         # Most of it is copying, which the interpreter can do while the pictures are drawn.
         cloud = beside.submit(write_ply, folder / "cloud.ply", inspection.cloud)
-        (folder / "profile.csv").write_text(profile_csv(inspection.step, inspection.part), encoding="utf-8")
-        (folder / "result.json").write_text(to_json(result_document(inspection, created)), encoding="utf-8")
-        (folder / "report.html").write_text(html(inspection, created), encoding="utf-8")
+        write_synced(folder / "profile.csv", profile_csv(inspection.step, inspection.part))
+        write_synced(folder / "result.json", to_json(result_document(inspection, created)))
+        write_synced(folder / "report.html", html(inspection, created))
         cloud.result()
     return out
 
@@ -122,16 +122,6 @@ def _finite(cloud: PartCloud | None) -> PartCloud | None:
         return cloud
     good = np.isfinite(cloud.points_mm).all(axis=1) & np.isfinite(cloud.deviation_mm)
     return PartCloud(**{field.name: getattr(cloud, field.name)[good] for field in fields(PartCloud)})
-
-
-def is_result(folder: Path) -> bool:
-    """Whether a folder is an earlier result and holds nothing else, so that it may be replaced."""
-    names = {entry.name for entry in folder.iterdir()}
-    try:
-        schema = json.loads((folder / "result.json").read_text(encoding="utf-8"))["schema"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-    return names <= set(FILES) and str(schema).startswith("weldscan-result/")
 
 
 # --- the files --------------------------------------------------------------------------------------------------------
@@ -153,9 +143,7 @@ def write_ply(path: Path, cloud: PartCloud | None) -> None:
         "property float x\nproperty float y\nproperty float z\n"
         "property uchar label\nproperty float deviation\nend_header\n"
     )
-    with path.open("wb") as file:
-        file.write(header.encode("ascii"))
-        file.write(rows.view(np.uint8).data)
+    write_synced(path, header, rows.view(np.uint8).data)
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from typing import Any
 
 from weldscan._weldcore import __version__
 from weldscan.errors import InputError
-from weldscan.session import write_whole
+from weldscan.records.files import read_bytes, write_file
 
 MARK = '<meta name="generator" content="weldscan calibrate">'
 
@@ -49,13 +49,13 @@ def write_page(path: Path, template: str, **values: Any) -> Path:
         return "–" if value is None or not math.isfinite(value) else f"{value:.3f}".replace("-", "−")
 
     check_page(path)
-    write_whole(path, fill(template, datetime.now(UTC), mark=Markup(MARK), mm=mm, **values))
+    write_file(path, fill(template, datetime.now(UTC), mark=Markup(MARK), mm=mm, **values))
     return path
 
 
 def check_page(path: Path) -> None:
     """Says early what would be in the way of a page."""
-    if path.exists() and (not path.is_file() or MARK not in path.read_text(encoding="utf-8", errors="replace")[:2000]):
+    if path.exists() and (not path.is_file() or MARK.encode() not in read_bytes(path)[:2000]):
         raise InputError(f"{path}: exists and is no page of a calibration: remove it or name another")
     if not path.absolute().parent.is_dir():
         raise InputError(f"{path}: cannot be written: {path.absolute().parent} is not a folder")

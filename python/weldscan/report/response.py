@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from weldscan.response import Response
+from weldscan.records.response import Response
 
 WIDTH, HEIGHT, MARGIN = 520, 420, 56
 

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from weldscan._weldcore import __version__
+from weldscan.records.files import plain, to_json, whole_folder, write_synced
+from weldscan.records.validation import is_validation, validation_document, validation_rows
 from weldscan.report.charts import LEFT, RIGHT, WIDTH, AngleAxis, Svg, arcs_of, nice_ticks
 from weldscan.report.page import fill
 from weldscan.report.pictures import diverging
 from weldscan.result import Validation
-from weldscan.session import plain, to_json, whole_folder
 
-SCHEMA = "weldscan-validation/1"
-FILES = ("validation.json", "validation.html")
 PAPER_MM = 0.115
 
 
@@ -28,51 +24,9 @@ def write_validation(found: Validation, out_dir: str | os.PathLike[str]) -> Path
     created = datetime.now(UTC)
     out = Path(out_dir)
     with whole_folder(out, is_validation) as folder:
-        (folder / "validation.json").write_text(to_json(plain(document(found, created))), encoding="utf-8")
-        (folder / "validation.html").write_text(html(found, created), encoding="utf-8")
+        write_synced(folder / "validation.json", to_json(plain(validation_document(found, created))))
+        write_synced(folder / "validation.html", html(found, created))
     return out
-
-
-def is_validation(folder: Path) -> bool:
-    """Whether a folder is an earlier comparison and holds nothing else."""
-    names = {entry.name for entry in folder.iterdir()}
-    try:
-        schema = json.loads((folder / "validation.json").read_text(encoding="utf-8"))["schema"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-    return names <= set(FILES) and schema == SCHEMA
-
-
-def document(found: Validation, created: datetime) -> dict[str, Any]:
-    """`weldscan-validation/1`."""
-    return {
-        "schema": SCHEMA,
-        "created": created.isoformat(timespec="seconds"),
-        "session": found.session,
-        "touch": found.touch,
-        "points": len(found.points_mm),
-        "compared": found.compared,
-        "mean_mm": found.mean_mm,
-        "mean_u_mm": found.mean_u_mm,
-        "rms_mm": found.rms_mm,
-        "max_abs_mm": found.max_abs_mm,
-        "per_point": [
-            {"point_mm": row[:3], "angle_deg": row[3], "axial_mm": row[4], "distance_mm": row[5], "u_mm": row[6]}
-            for row in _rows(found)
-        ],
-        "uncertainty_budget": [
-            {"name": line.name, "standard_mm": line.standard_mm, "derived_from": line.derived_from}
-            for line in found.budget
-        ],
-        "software": {"version": __version__, **found.software},
-    }
-
-
-def _rows(found: Validation) -> list[list[float]]:
-    rows: list[list[float]] = np.column_stack(
-        [found.points_mm, found.angle_deg, found.axial_mm, found.distance_mm, found.u_mm]
-    ).tolist()
-    return rows
 
 
 def html(found: Validation, created: datetime) -> str:
@@ -88,7 +42,7 @@ def html(found: Validation, created: datetime) -> str:
         typical_u=float(np.nanmedian(found.u_mm)),
         where=where(found),
         distances=distances(found),
-        rows=_rows(found),
+        rows=validation_rows(found),
         mm=shown,
         number=shown,
     )

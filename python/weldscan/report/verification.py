@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import __version__
+from weldscan.records.files import plain, to_json, whole_folder, write_synced
+from weldscan.records.verification import is_verification, verification_document
 from weldscan.report import ICONS
 from weldscan.report.charts import LEFT, RIGHT, WIDTH, Svg, nice_ticks, number
 from weldscan.report.page import fill
 from weldscan.report.pictures import data_uri, diverging
 from weldscan.result import Characteristic, Drift, Verification
-from weldscan.session import plain, to_json, whole_folder
 
 Floats = NDArray[np.float64]
 
-SCHEMA = "weldscan-verification/1"
-FILES = ("verification.json", "verification.html")
 SCALES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
 
@@ -42,53 +38,9 @@ def write_verification(found: Verification, out_dir: str | os.PathLike[str]) -> 
     created = datetime.now(UTC)
     out = Path(out_dir)
     with whole_folder(out, is_verification) as folder:
-        (folder / "verification.json").write_text(to_json(plain(document(found, created))), encoding="utf-8")
-        (folder / "verification.html").write_text(html(found, created), encoding="utf-8")
+        write_synced(folder / "verification.json", to_json(plain(verification_document(found, created))))
+        write_synced(folder / "verification.html", html(found, created))
     return out
-
-
-def is_verification(folder: Path) -> bool:
-    """Whether a folder is an earlier verification and holds nothing else."""
-    names = {entry.name for entry in folder.iterdir()}
-    try:
-        schema = json.loads((folder / "verification.json").read_text(encoding="utf-8"))["schema"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-    return names <= set(FILES) and schema == SCHEMA
-
-
-def document(found: Verification, created: datetime) -> dict[str, Any]:
-    """`weldscan-verification/1`."""
-    return {
-        "schema": SCHEMA,
-        "created": created.isoformat(timespec="seconds"),
-        "session": found.session,
-        "scanner": found.scanner,
-        "fringes": found.fringes,
-        "date": found.date,
-        "date_from": found.date_from,
-        "valid_until": found.valid_until,
-        "verdict": found.verdict,
-        "limits": found.limits,
-        "span_mm": found.span_mm,
-        "characteristics": {
-            each.name: {name: value for name, value in vars(each).items() if name != "name"}
-            for each in found.characteristics
-        },
-        "spheres": [_row(ball) for ball in found.balls],
-        "distances": [_row(each) | {"error_mm": each.error_mm} for each in found.spacings],
-        "planes": [_row(plane) for plane in found.planes],
-        "lost": [{"shot": shot, "reason": reason} for shot, reason in found.lost],
-        "assumed": found.assumed,
-        "warnings": found.warnings,
-        "drift": {each.name: vars(each) for each in found.drift},
-        "notes": found.notes,
-        "software": {"version": __version__, **found.software},
-    }
-
-
-def _row(each: Any) -> dict[str, Any]:
-    return {name: value for name, value in vars(each).items() if name != "residual_mm"}
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------

@@ -11,7 +11,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
 from pydantic import BaseModel, ConfigDict, Field
 
 from weldscan.devices.camera import Camera, Image
@@ -19,9 +18,9 @@ from weldscan.devices.projector import Projector
 from weldscan.devices.robot import Robot, wait_until_still
 from weldscan.errors import DeviceError, InputError
 from weldscan.fringes import board_fringes, fringe_patterns
-from weldscan.manifest import replace_durably, sync_folder, to_bytes, write_durably
 from weldscan.pose import KukaPose
-from weldscan.session import PNG_PARAMETERS, whole_folder
+from weldscan.records.files import to_json, whole_folder, write_synced
+from weldscan.records.images import encode_png
 from weldscan.station.capture import Quality, capture_stack, judge, set_exposure
 from weldscan.station.cell import CellConfig, check
 
@@ -82,7 +81,7 @@ def capture_board(cell: CellConfig, folder: Path, board: str | None, tell: Tell,
         }
         document |= {} if board is None else {"board": board}
         document |= {} if settings.temperature_c is None else {"temperature_c": settings.temperature_c}
-        replace_durably(partial / "calibration.json", to_bytes(document))
+        write_synced(partial / "calibration.json", to_json(document))
         set_exposure(camera, projector, camera.settings.exposure_s)
         count = len(settings.poses) or settings.count
         for number in range(count):
@@ -119,8 +118,7 @@ def _refuse(name: str, quality: Quality, settings: BoardSettings) -> None:
 def _keep(folder: Path, images: list[Image]) -> None:
     folder.mkdir(parents=True)
     for index, image in enumerate(images):
-        done, data = cv2.imencode(".png", image, PNG_PARAMETERS)
-        if not done:
-            raise DeviceError(f"{folder.name}: a frame cannot be encoded")
-        write_durably(folder / f"{index:03d}.png", data.tobytes())
-    sync_folder(folder)
+        try:
+            write_synced(folder / f"{index:03d}.png", encode_png(image))
+        except InputError as error:
+            raise DeviceError(f"{folder.name}: {error}") from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,7 +11,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from weldscan.devices import BACKENDS, backend
 from weldscan.devices.robot import Robot
 from weldscan.errors import InputError
-from weldscan.session import explain
+from weldscan.records.fields import explain
+from weldscan.records.files import read_toml
 
 M = TypeVar("M", bound=BaseModel)
 SELECTOR = {"robot": "link", "camera": "backend", "projector": "backend"}
@@ -71,14 +71,7 @@ class CellConfig(BaseModel):
 
 def read_cell(path: Path) -> CellConfig:
     """Read `cell.toml`; a wrong field is named in an `InputError`."""
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; weldscan scan --example-config FOLDER writes a complete one") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not TOML: {error}") from None
+    document = read_toml(path, "file; weldscan scan --example-config FOLDER writes a complete one")
     config = check(document, CellConfig, str(path))
     config._path = path
     return config

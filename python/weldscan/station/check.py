@@ -8,17 +8,17 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from weldscan.calibration.response import response_of_ramp
 from weldscan.devices.camera import Camera, Image
 from weldscan.devices.projector import Projector
 from weldscan.errors import DeviceError, DeviceTimeout
 from weldscan.fringes import flat_pattern
-from weldscan.manifest import write_durably
-from weldscan.response import Response, response_of_ramp
-from weldscan.session import PNG_PARAMETERS
+from weldscan.records.files import write_file
+from weldscan.records.images import encode_png
+from weldscan.records.response import Response
 from weldscan.station.capture import full_scale, set_exposure
 
 LONGEST_LATENCY_S = 2.0
@@ -81,7 +81,7 @@ def response(
         images = [camera.capture().image for _ in range(frames)]
         light.append(float(np.mean([image[lit].mean() for image in images])))
         if keep is not None:
-            write_durably(keep / f"ramp_{level:03d}.png", cv2.imencode(".png", images[0], PNG_PARAMETERS)[1].tobytes())
+            write_file(keep / f"ramp_{level:03d}.png", encode_png(images[0]))
     return response_of_ramp(shown, light)
 
 

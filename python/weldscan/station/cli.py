@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from weldscan.devices.controller import Arm, Controller
     from weldscan.devices.robot import Robot, StampedPose
     from weldscan.pose import KukaPose
-    from weldscan.session import ShotSpec
+    from weldscan.records.session import ShotSpec
 
 
 def _group(about: str) -> typer.Typer:
@@ -161,8 +161,8 @@ def camera_preview(
     count: Annotated[int, typer.Option(min=0, help="How many frames; 0: until Ctrl-C.")] = 0,
 ) -> None:
     """Look through the camera: a picture that is written again and again, and the shares of useless pixels."""
-    import cv2
-
+    from weldscan.records.files import write_file
+    from weldscan.records.images import encode_png
     from weldscan.station.capture import full_scale
     from weldscan.station.cell import read_cell
     from weldscan.station.check import LEAST_CONTRAST, overlay
@@ -172,9 +172,7 @@ def camera_preview(
         while count == 0 or done < count:
             frame = camera.capture()
             top = full_scale([frame.image])
-            fresh = out.with_name(f".{out.name}.new.png")
-            cv2.imwrite(str(fresh), overlay(frame.image))
-            fresh.replace(out)
+            write_file(out, encode_png(overlay(frame.image)))
             saturated, dark = (frame.image >= top).mean(), (frame.image <= LEAST_CONTRAST * top).mean()
             print(
                 f"{frame.image.shape[1]}x{frame.image.shape[0]}, {camera.exposure_s * 1000:g} ms: "
@@ -226,7 +224,7 @@ def devices_check(
 
     The response is the projector's own: a table that the configuration has already is not applied.
     """
-    from weldscan.manifest import replace_durably, to_bytes
+    from weldscan.records.response import write_response
     from weldscan.station import check
     from weldscan.station.cell import read_cell
 
@@ -242,7 +240,7 @@ def devices_check(
         if ramp is not None:
             ramp.mkdir(parents=True, exist_ok=True)
         table = check.response(camera, projector, keep=ramp)
-        replace_durably(out, to_bytes(table.document()))
+        write_response(out, table)
         named = out.name if out.parent == config.parent else out.resolve()
         print(f'response   gamma {check.gamma(table):.3f}, in {out}; [projector] response = "{named}" corrects it')
 
@@ -319,6 +317,8 @@ def _controller(link: str, arm: Arm, host: str, port: int | None) -> Any:
     for attempt in (usual, 0) if port is None else (port,):
         try:
             return kind(arm, host=host, port=attempt)
+        except UnicodeError:
+            raise InputError(f"--host: {host!r} should be a host's name or address") from None
         except OSError as error:
             complaint = f"{host}:{attempt}: cannot listen: {error.strerror or error}"
     raise DeviceError(complaint)

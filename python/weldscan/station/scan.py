@@ -22,9 +22,10 @@ from weldscan.devices.projector import Projector
 from weldscan.devices.robot import Robot, StampedPose, distance, wait_until_still
 from weldscan.errors import DeviceError, InputError, WeldscanError
 from weldscan.fringes import flat_pattern, fringe_patterns
-from weldscan.manifest import read_plan
 from weldscan.pose import KukaPose
-from weldscan.session import FlangePose, Session, ShotSpec, read_hand_eye
+from weldscan.records.hand_eye import read_hand_eye
+from weldscan.records.plan import read_plan
+from weldscan.records.session import FlangePose, Session, ShotSpec
 from weldscan.station.capture import Quality, capture_stack, judge, set_exposure
 from weldscan.station.cell import CellConfig, check
 from weldscan.station.store import LOG, ShotStore

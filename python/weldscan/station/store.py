@@ -15,23 +15,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import cv2
 from pydantic import ValidationError
 
 from weldscan.devices.camera import Image
 from weldscan.errors import InputError
-from weldscan.manifest import (
-    PLAN,
-    SHOT,
-    ShotManifest,
-    read_manifest,
-    read_plan,
-    replace_durably,
-    sync_folder,
-    to_bytes,
-    write_durably,
-)
-from weldscan.session import PNG_PARAMETERS, Session, ShotSpec, frame_names
+from weldscan.records.files import to_json, whole_folder, write_file, write_synced
+from weldscan.records.images import encode_png
+from weldscan.records.plan import PLAN, read_plan
+from weldscan.records.session import Session, ShotSpec, frame_names
+from weldscan.records.shot import SHOT, ShotManifest, read_manifest
 
 try:
     import fcntl
@@ -39,8 +31,8 @@ except ImportError:  # Windows: two scans into one folder are then not noticed
     fcntl = None  # type: ignore[assignment]
 
 LOCK, LOG = ".scan.lock", "scan.log"
-BEFORE_THE_PLAN = {LOCK, LOG, f".{PLAN}.new"}
-"""What a scan that died at once may have left."""
+UNFINISHED = ".*.partial"
+"""What a scan that was killed while it wrote may have left."""
 
 
 class ShotStore:
@@ -55,20 +47,23 @@ class ShotStore:
             raise InputError(f"{folder}: exists and is not a folder")
         if started and not resume:
             raise InputError(f"{folder}: holds a scan already; --resume goes on with it")
-        if not started and folder.is_dir() and not {entry.name for entry in folder.iterdir()} <= BEFORE_THE_PLAN:
+        if not started and folder.is_dir() and not _only_just_begun(folder):
             raise InputError(f"{folder}: exists and holds something else; name another folder or remove it")
         if started and read_plan(folder / PLAN) != plan:
             raise InputError(f"{folder}: was begun with another plan; finish it with that one, or name another folder")
         with self._writing():
             folder.mkdir(parents=True, exist_ok=True)
+            for own in (folder / LOCK, folder / LOG):
+                if own.exists() and not own.is_file():
+                    raise InputError(f"{own}: is no regular file")
             self._lock = (folder / LOCK).open("w")
         try:
-            self._begin(None if started else to_bytes(document))
+            self._begin(None if started else to_json(document))
         except BaseException:
             self._lock.close()
             raise
 
-    def _begin(self, plan: bytes | None) -> None:
+    def _begin(self, plan: str | None) -> None:
         """Be the only one here, leave the plan, look what is there."""
         if fcntl is not None:
             try:
@@ -76,8 +71,10 @@ class ShotStore:
             except OSError:
                 raise InputError(f"{self.folder}: another scan is writing there") from None
         with self._writing():
+            for unfinished in self.folder.glob(UNFINISHED):
+                unfinished.unlink()
             if plan is not None:
-                replace_durably(self.folder / PLAN, plan)
+                write_file(self.folder / PLAN, plan)
             self._shots.mkdir(exist_ok=True)
         self.redone: dict[str, str] = {}
         """Shots that were there but not whole, with the reason; they are taken again."""
@@ -111,25 +108,15 @@ class ShotStore:
         }
         for row, white in zip(names, whites, strict=True):
             images[row[0].removesuffix("000.png") + "white.png"] = white
-        partial, final = self._shots / f".{shot.name}.partial", self._shots / shot.name
-        try:
-            with self._writing():
-                shutil.rmtree(partial, ignore_errors=True)
-                partial.mkdir()
-                files = {}
-                for name, image in images.items():
-                    data = cv2.imencode(".png", image, PNG_PARAMETERS)[1].tobytes()
-                    write_durably(partial / name, data)
-                    files[name] = hashlib.sha256(data).hexdigest()
-                manifest = ShotManifest(schema="weldscan-shot/1", shot=shot, files=files, record=record)
-                text = manifest.model_dump(mode="json", exclude_none=True, by_alias=True)
-                write_durably(partial / SHOT, to_bytes(text))
-                sync_folder(partial)
-                partial.rename(final)
-                sync_folder(self._shots)
-        except BaseException:
-            shutil.rmtree(partial, ignore_errors=True)
-            raise
+        with whole_folder(self._shots / shot.name) as partial:
+            files = {}
+            for name, image in images.items():
+                data = encode_png(image)
+                write_synced(partial / name, data)
+                files[name] = hashlib.sha256(data).hexdigest()
+            manifest = ShotManifest(schema="weldscan-shot/1", shot=shot, files=files, record=record)
+            text = manifest.model_dump(mode="json", exclude_none=True, by_alias=True)
+            write_synced(partial / SHOT, to_json(text))
         self._whole[shot.name] = shot
         self._write_session()
 
@@ -164,14 +151,14 @@ class ShotStore:
         """Make `session.json` of the whole shots, as soon as they are a session that can be inspected."""
         document = self.plan.model_dump(mode="json", exclude_none=True, by_alias=True)
         document["shots"] = [shot.model_dump(mode="json", exclude_none=True) for shot in self.whole]
-        data = to_bytes(document)
+        data = to_json(document)
         with self._writing():
             try:
                 Session.model_validate_json(data)
             except ValidationError:
                 (self.folder / "session.json").unlink(missing_ok=True)
             else:
-                replace_durably(self.folder / "session.json", data)
+                write_file(self.folder / "session.json", data)
 
     @contextlib.contextmanager
     def _writing(self) -> Any:
@@ -187,3 +174,8 @@ class ShotStore:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _only_just_begun(folder: Path) -> bool:
+    """Whether a folder without a plan holds nothing but what a scan that died at once may have left."""
+    return all(entry.name in (LOCK, LOG) or entry.match(UNFINISHED) for entry in folder.iterdir())

@@ -30,10 +30,12 @@ from weldscan._weldcore import __version__
 from weldscan.calibration.artefact import PlateMismatch
 from weldscan.calibration.hand_eye import base_from_flange
 from weldscan.errors import GeometryError, InputError
-from weldscan.manifest import left_out, read_manifest
 from weldscan.points import PointReader, Progress
+from weldscan.records.fields import moment
+from weldscan.records.scanner import ScannerSpec
+from weldscan.records.session import Session, read_session
+from weldscan.records.shot import left_out, read_manifest
 from weldscan.result import BallError, Characteristic, PlaneError, SpacingError, Verdict, Verification, warning
-from weldscan.session import ScannerSpec, Session, read_session
 from weldscan.verification.form import FormError, flatness_error, noise_range, probing_error
 from weldscan.verification.limits import VerificationLimits, limits_from, read_limits
 from weldscan.verification.standards import ball_errors, plane_error, touched_distance_u_mm
@@ -179,18 +181,6 @@ def scanner_id(scanner: ScannerSpec) -> str:
 def fringes_of(session: Session) -> str:
     """The fringe sets in a line: axis, periods and steps of each."""
     return ", ".join(f"{fringe.axis} {fringe.periods:g} x {fringe.steps}" for fringe in session.fringes)
-
-
-def moment(text: str, where: str) -> datetime:
-    """A date or time in ISO 8601; UTC where it names no zone."""
-    try:
-        found = datetime.fromisoformat(text)
-    except ValueError:
-        raise InputError(f"{where}: {text!r} is not a date as 2026-01-31 or 2026-01-31T12:00:00+00:00") from None
-    try:
-        return (found.replace(tzinfo=UTC) if found.tzinfo is None else found).astimezone(UTC)
-    except (OverflowError, ValueError):
-        raise InputError(f"{where}: {text!r} is out of range") from None
 
 
 def _date(session: Session, date: str | None, now: datetime) -> tuple[datetime, str]:

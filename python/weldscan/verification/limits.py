@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,7 +10,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from weldscan.errors import InputError
-from weldscan.session import explain, read_text
+from weldscan.records.fields import explain
+from weldscan.records.files import read_toml
 
 # No scanner of a hand's or an arm's reach has a limit of centimetres: those are micrometres.
 Limit = Annotated[float, Field(gt=0, le=5, allow_inf_nan=False, strict=True)]
@@ -90,10 +90,7 @@ def read_limits(path: str | os.PathLike[str]) -> VerificationLimits:
         0.05
     """
     path = Path(path)
-    try:
-        document = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not TOML: {error}") from None
+    document = read_toml(path)
     where = str(path)
     if "verification" in document:
         where, document = f"{path}: verification", document["verification"]

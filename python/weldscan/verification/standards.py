@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from weldscan._weldcore import FoundSphere, Lens, estimate_normals, find_spheres, fit_plane
 from weldscan.calibration.artefact import PAIRS, TOUCH_SIGMA_MM, PlateMismatch, distances
 from weldscan.errors import GeometryError, InputError
+from weldscan.records.session import ArtefactSpec, PlaneSpec
 from weldscan.result import BallError, PlaneError, SpacingError
-from weldscan.session import ArtefactSpec, PlaneSpec
 from weldscan.verification.form import (
     PLANE_SAMPLE,
     PLANE_ZONE,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import os
 from collections.abc import Mapping
 from datetime import datetime
@@ -15,6 +14,7 @@ import numpy as np
 
 from weldscan._weldcore import __version__
 from weldscan.errors import InputError
+from weldscan.records.files import is_earlier, plain, read_json
 from weldscan.result import (
     FATES,
     ArtefactShot,
@@ -31,10 +31,10 @@ from weldscan.result import (
     Verdict,
     along_seam_mm,
 )
-from weldscan.session import plain, read_text
 
 SCHEMA = "weldscan-result/2"
 READABLE = ("weldscan-result/1", SCHEMA)
+FILES = ("result.json", "report.html", "profile.csv", "cloud.ply")
 CLASSES = {
     "reference_wall": Label.REFERENCE_WALL,
     "other_wall": Label.OTHER_WALL,
@@ -47,6 +47,11 @@ def report_id(inspection: Inspection, created: datetime) -> str:
     """A number that no other report has: the day, and a hash of the session and the moment."""
     text = f"{inspection.session}|{inspection.software.get('session_sha256', '')}|{created.isoformat()}"
     return f"{created:%Y%m%d}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def is_result(folder: Path) -> bool:
+    """Whether a folder is an earlier result and holds nothing else, so that it may be replaced."""
+    return is_earlier(folder, FILES, FILES[0], "weldscan-result/")
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -327,12 +332,7 @@ def read_result(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     path = Path(path)
     file = path / "result.json" if path.is_dir() else path
-    try:
-        document = json.loads(read_text(file))
-    except RecursionError:
-        raise InputError(f"{file}: is nested too deeply") from None
-    except ValueError as error:
-        raise InputError(f"{file}: is not JSON: {error}") from None
+    document = read_json(file)
     schema = document.get("schema") if isinstance(document, dict) else None
     if schema not in READABLE:
         raise InputError(f"{file}: schema: must be one of {', '.join(READABLE)}, got {schema!r}")

@@ -21,7 +21,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from weldscan._weldcore import phase_error_of_harmonics
 from weldscan.errors import GeometryError, InputError
-from weldscan.session import explain, read_text
+from weldscan.records.fields import explain, read_model
+from weldscan.records.files import to_json, write_file
 
 Steps = Annotated[int, Field(ge=3)]
 Coefficients = tuple[float, ...]
@@ -162,78 +163,11 @@ def measured(
         raise InputError(f"response: {explain(error)}") from None
 
 
-RAMP_LEVELS = 8
-"""A power law through fewer is a guess about what lies between them."""
-
-
-def response_of_ramp(level: ArrayLike, light: ArrayLike, *, noise: float = 0.0) -> Response:
-    """The response that even images of several levels show.
-
-    Args:
-        level: of each image, 0 to 255 with both ends, in any order; of repeated ones the mean counts.
-        light: mean grey value of each, over pixels that do not saturate.
-        noise: standard deviation of a light. By how much the next level may be darker: five times that, at least 1 %
-            of the range.
-
-    Raises:
-        InputError: fewer than 8 levels, a light that is not finite or falls with the level, white that is clipped.
-
-    Example:
-        >>> from weldscan.response import response_of_ramp
-        >>> level = [0, 36, 73, 109, 146, 182, 219, 255]
-        >>> round(response_of_ramp(level, [10 + 180 * (v / 255) ** 2.2 for v in level]).gamma, 2)
-        2.2
-    """
-    levels, lights = np.asarray(level, np.float64), np.asarray(light, np.float64)
-    if levels.ndim != 1 or levels.shape != lights.shape:
-        raise InputError(f"ramp: {levels.shape} levels for {lights.shape} lights")
-    if not np.isfinite(lights).all():
-        raise InputError(f"ramp: light: not finite at level {levels[~np.isfinite(lights)][0]:g}")
-    at, which = np.unique(levels, return_inverse=True)
-    if at.size < RAMP_LEVELS:
-        raise InputError(f"ramp: {at.size} levels, at least {RAMP_LEVELS} needed from 0 to 255")
-    means = np.bincount(which, lights) / np.bincount(which)
-    span = float(means[-1] - means[0])
-    if not span > 0:
-        raise InputError(f"ramp: light does not rise from black ({means[0]:.1f}) to white ({means[-1]:.1f})")
-    fall = np.maximum.accumulate(means) - means
-    if fall.max() > max(5 * noise, 0.01 * span):
-        raise InputError(
-            f"ramp: light falls by {100 * fall.max() / span:.1f} % of its range up to level {at[fall.argmax()]:g}: "
-            "images out of order, an automatic exposure, or a display that switches its contrast"
-        )
-    clipped = at[means >= means[-1] - max(noise, 1e-3 * span)]
-    # A display may well clip its own uppermost levels: a table corrects that.
-    if clipped.size >= 3 and clipped[0] < 0.8 * 255:
-        raise InputError(f"ramp: all levels from {clipped[0]:g} on are equally bright: saturated; expose less")
-    return measured(at, means)
-
-
 def write_response(path: str | os.PathLike[str], response: Response) -> None:
     """Write a `weldscan-response/1` file; an earlier one is replaced. Raises `InputError` where it cannot be."""
-    path = Path(path)
-    fresh = path.with_name(f".{path.name}.new")
-    try:
-        fresh.write_text(json.dumps(response.document(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        fresh.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None
-
-
-def gamma_of_second_harmonic(ratio: float) -> float:
-    """Return the power law's exponent whose second harmonic is this part of the fundamental, (g - 1)/(g + 2).
-
-    >>> from weldscan import harmonics_of_gamma
-    >>> round(gamma_of_second_harmonic(harmonics_of_gamma(1.8)[0]), 6)
-    1.8
-    """
-    return (1 + 2 * ratio) / (1 - ratio)
+    write_file(Path(path), to_json(response.document()))
 
 
 def read_response(path: str | os.PathLike[str]) -> Response:
     """Read a `weldscan-response/1` file. Raises `InputError`, naming the file and the field."""
-    path = Path(path)
-    try:
-        return Response.model_validate_json(read_text(path))
-    except ValidationError as error:
-        raise InputError(f"{path}: {explain(error)}") from None
+    return read_model(Path(path), Response)

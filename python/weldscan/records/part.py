@@ -1,0 +1,47 @@
+"""The welded part of a session, as the drawing has it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from weldscan.records.fields import PARALLEL_SINE, Direction, Model, Positive
+
+
+class PartSpec(Model):
+    """The welded part, as the drawing has it. Directions are in base, or in the scanner's frame without a robot."""
+
+    kind: Literal["pipe"]
+    outside_diameter: Positive
+    wall_thickness: Positive
+    joint: Annotated[str, Field(min_length=1, max_length=100)]
+    axis_base: Direction | None = None
+    """From the reference wall to the other wall."""
+    zero_base: Direction | None = None
+    """The 0 degree mark; angles are right-handed about the axis."""
+    other_wall_thickness: Positive | None = None
+    """Rated thickness of the other wall, where it differs."""
+    machined_after_welding: bool = False
+    side: Literal["welding", "opposite"] = "welding"
+    """Which side of the joint was scanned."""
+    required_coverage_deg: Annotated[float, Field(gt=0, le=360)] | None = None
+    """How much of the seam must be seen for a PASS; 360: all of it."""
+
+    @model_validator(mode="after")
+    def _is_a_pipe(self) -> Self:
+        for name in ("wall_thickness", "other_wall_thickness"):
+            wall = getattr(self, name)
+            if wall is not None and wall >= self.outside_diameter / 2:
+                raise ValueError(
+                    f"{name}: {wall:g} mm is not less than the outside radius of {self.outside_diameter / 2:g} mm"
+                )
+        if self.axis_base is not None and self.zero_base is not None:
+            axis, zero = np.asarray(self.axis_base), np.asarray(self.zero_base)
+            if np.linalg.norm(np.cross(axis, zero)) < PARALLEL_SINE * np.linalg.norm(axis) * np.linalg.norm(zero):
+                raise ValueError("zero_base: is parallel to axis_base, so no angle about the axis is defined")
+        elif (self.axis_base is None) != (self.zero_base is None):
+            absent = "axis_base" if self.axis_base is None else "zero_base"
+            raise ValueError(f"{absent}: missing, while the other of axis_base and zero_base is given")
+        return self

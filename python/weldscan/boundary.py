@@ -172,7 +172,7 @@ def _told(error: BaseException, struck: bool) -> tuple[int | str | None, str | N
     if isinstance(error, MemoryError):
         return (
             BAD_INPUT,
-            f"not enough memory: {error}; give less at once, or more memory".replace(": ;", ";"),
+            f"not enough memory{': ' * bool(str(error))}{error}; give less at once, or more memory",
         )
     if isinstance(error, RecursionError):
         return BAD_INPUT, f"an input is nested too deeply: {error}"

@@ -136,9 +136,9 @@ def robot_simulate(
         for request in fault or []:
             _inject(controller, request.replace(":", " "))
         where = {} if link == "serial" else {"host": host}
-        print(json.dumps({"link": link, **where, "port": controller.port}), flush=True)
-        threading.Thread(target=_obey_lines, args=(controller,), daemon=True).start()
         with contextlib.suppress(KeyboardInterrupt):
+            print(json.dumps({"link": link, **where, "port": controller.port}), flush=True)
+            threading.Thread(target=_obey_lines, args=(controller,), daemon=True).start()
             threading.Event().wait()
 
 

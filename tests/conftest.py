@@ -1,5 +1,7 @@
 """What several test files need."""
 
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -28,3 +30,12 @@ def soak(request: pytest.FixtureRequest) -> bool:
 @pytest.fixture
 def rsi_cycles(soak: bool) -> int:
     return 10_000 if soak else 150
+
+
+@pytest.fixture(autouse=True)
+def signals() -> Iterator[None]:
+    """A command that ran in this process leaves the signals as the end of a process needs them: put back."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)

@@ -69,7 +69,7 @@ def test_the_verdict_is_the_exit_code(run, tmp_path, finds, code, verdict):
         (InputError("a/session.json: name: missing"), 2, "weldscan: a/session.json: name: missing"),
         (GeometryError("three\nlines of\ntext"), 2, "weldscan: three lines of text"),
         (NotMeasured("no weld in view"), 5, "weldscan: no weld in view"),
-        (KeyboardInterrupt(), 130, ""),
+        (KeyboardInterrupt(), 130, "weldscan: interrupted"),
         (
             ZeroDivisionError("oh"),
             1,
@@ -78,7 +78,7 @@ def test_the_verdict_is_the_exit_code(run, tmp_path, finds, code, verdict):
     ],
 )
 def test_an_error_is_one_line_and_leaves_nothing(run, tmp_path, error, code, says):
-    assert run("inspect", "pipe-17", finds=error) == (code, "", [says] if says else [])
+    assert run("inspect", "pipe-17", finds=error) == (code, "", [says])
     assert list(tmp_path.iterdir()) == []
 
 

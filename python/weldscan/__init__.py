@@ -1,82 +1,79 @@
 """weldscan measures the edge displacement of butt welds from structured-light scans."""
 
-from __future__ import annotations
-
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-from weldscan._weldcore import (
-    Cloud,
-    Cylinder,
-    CylinderFit,
-    Follower,
-    FoundSphere,
-    KdTree,
-    Lens,
-    Mesh,
-    PhaseError,
-    PhaseMap,
-    Plane,
-    PlaneFit,
-    ReferencePlane,
-    Registration,
-    RigidFit,
-    Scanner,
-    SimulatedShot,
-    Sphere,
-    SphereFit,
-    WeakDirection,
-    WeldShot,
-    WrappedPhase,
-    __version__,
-    calibrate_reference_plane,
-    decode,
-    decode_gray,
-    decode_phase,
-    decode_png,
-    distance,
-    estimate_normals,
-    estimate_phase_error,
-    find_spheres,
-    fit_cylinder,
-    fit_plane,
-    fit_sphere,
-    harmonics_of_gamma,
-    height_from_reference,
-    measure_step,
-    phase_error_of_harmonics,
-    place_shots,
-    register_icp,
-    register_rigid,
-    segment_weld,
-    set_threads,
-    simulate_shot,
-    simulated_step,
-    sphere_through_points,
-    triangulate,
-    unwrap_spatial,
-    unwrap_temporal,
-)
-from weldscan.errors import DeviceError, DeviceTimeout, GeometryError, InputError, NotMeasured, WeldscanError
-from weldscan.pose import (
-    KukaPose,
-    format_e6axis,
-    format_e6pos,
-    format_frame,
-    kuka_from_matrix,
-    matrix_from_kuka,
-    parse_e6axis,
-    parse_e6pos,
-    parse_frame,
-)
-
+TYPE_CHECKING = False  # what `typing` has, without importing it
 if TYPE_CHECKING:
+    from typing import Any
+
+    from weldscan._weldcore import (
+        Cloud,
+        Cylinder,
+        CylinderFit,
+        Follower,
+        FoundSphere,
+        KdTree,
+        Lens,
+        Mesh,
+        PhaseError,
+        PhaseMap,
+        Plane,
+        PlaneFit,
+        ReferencePlane,
+        Registration,
+        RigidFit,
+        Scanner,
+        SimulatedShot,
+        Sphere,
+        SphereFit,
+        WeakDirection,
+        WeldShot,
+        WrappedPhase,
+        __version__,
+        calibrate_reference_plane,
+        decode,
+        decode_gray,
+        decode_phase,
+        decode_png,
+        distance,
+        estimate_normals,
+        estimate_phase_error,
+        find_spheres,
+        fit_cylinder,
+        fit_plane,
+        fit_sphere,
+        harmonics_of_gamma,
+        height_from_reference,
+        measure_step,
+        phase_error_of_harmonics,
+        place_shots,
+        register_icp,
+        register_rigid,
+        segment_weld,
+        set_threads,
+        simulate_shot,
+        simulated_step,
+        sphere_through_points,
+        triangulate,
+        unwrap_spatial,
+        unwrap_temporal,
+    )
     from weldscan.calibration.hand_eye import solve_hand_eye
     from weldscan.calibration.response import compensate_phase, estimate_response, response_of_folder, response_of_ramp
     from weldscan.calibration.scanner import BoardView, calibrate_scanner, solve_scanner
+    from weldscan.errors import DeviceError, DeviceTimeout, GeometryError, InputError, NotMeasured, WeldscanError
     from weldscan.inspection import inspect
     from weldscan.norms import judge, limit_mm, norm_ids
     from weldscan.paper_method import paper_step
+    from weldscan.pose import (
+        KukaPose,
+        format_e6axis,
+        format_e6pos,
+        format_frame,
+        kuka_from_matrix,
+        matrix_from_kuka,
+        parse_e6axis,
+        parse_e6pos,
+        parse_frame,
+    )
     from weldscan.records.frames import iter_frames, read_frames
     from weldscan.records.history import append_history, read_history
     from weldscan.records.response import FringeResponse, Response, read_response, write_response
@@ -91,7 +88,8 @@ if TYPE_CHECKING:
     from weldscan.verification import VerificationLimits, flatness_error, probing_error, read_limits, verify
     from weldscan.verification.history import standing_of
 
-# The faces are imported when they are asked for: they bring pydantic and OpenCV, which an algorithm does not need.
+# Names are imported when they are asked for: a command is to stand behind its error boundary before anything heavy is
+# loaded, and an algorithm needs neither pydantic nor OpenCV. What is in none of these is the core's.
 _LAZY = {
     "weldscan.calibration.hand_eye": ("solve_hand_eye",),
     "weldscan.calibration.response": (
@@ -101,9 +99,21 @@ _LAZY = {
         "response_of_ramp",
     ),
     "weldscan.calibration.scanner": ("BoardView", "calibrate_scanner", "solve_scanner"),
+    "weldscan.errors": ("DeviceError", "DeviceTimeout", "GeometryError", "InputError", "NotMeasured", "WeldscanError"),
     "weldscan.inspection": ("inspect",),
     "weldscan.paper_method": ("paper_step",),
     "weldscan.norms": ("judge", "limit_mm", "norm_ids"),
+    "weldscan.pose": (
+        "KukaPose",
+        "format_e6axis",
+        "format_e6pos",
+        "format_frame",
+        "kuka_from_matrix",
+        "matrix_from_kuka",
+        "parse_e6axis",
+        "parse_e6pos",
+        "parse_frame",
+    ),
     "weldscan.records.frames": ("iter_frames", "read_frames"),
     "weldscan.records.history": ("append_history", "read_history"),
     "weldscan.records.response": ("FringeResponse", "Response", "read_response", "write_response"),
@@ -128,12 +138,20 @@ _LAZY = {
 }
 
 
-def __getattr__(name: str) -> Any:
-    for module, names in _LAZY.items():
-        if name in names:
-            value = globals()[name] = getattr(import_module(module), name)
-            return value
+def __getattr__(name: str) -> "Any":
+    from importlib import import_module
+
+    if name in __all__:
+        module = next((module for module, names in _LAZY.items() if name in names), "weldscan._weldcore")
+        value = globals()[name] = getattr(import_module(module), name)
+        return value
+    if f"weldscan.{name}" in _LAZY or name == "_weldcore":
+        return import_module(f"weldscan.{name}")
     raise AttributeError(f"module 'weldscan' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
 
 
 __all__ = [

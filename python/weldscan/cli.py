@@ -8,40 +8,37 @@ exit code is fixed before anything is printed: a console that lacks a character 
 from __future__ import annotations
 
 import json
-import os
 import sys
-import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from weldscan import terminal
+from weldscan import boundary, terminal
 from weldscan._weldcore import __version__
 from weldscan.calibration.cli import register as register_calibrations
-from weldscan.errors import InputError, NotMeasured, WeldscanError
-from weldscan.result import Severity, Verdict
+from weldscan.errors import InputError
 from weldscan.station.cli import register as register_cell
 
 if TYPE_CHECKING:
-    from weldscan.result import Inspection, StepResult, Verification
+    from weldscan.result import Inspection, StepResult, Verdict, Verification
 
+# By the verdict's word: what a verdict is is imported when there is one.
 EXIT_CODES = {
-    Verdict.PASS: 0,
-    Verdict.FAIL: 3,
-    Verdict.INCONCLUSIVE: 4,
-    Verdict.NOT_MEASURED: 5,
-    Verdict.NOT_ASSESSABLE: 5,
+    "PASS": 0,
+    "FAIL": 3,
+    "INCONCLUSIVE": 4,
+    "NOT MEASURED": boundary.NOT_MEASURED,
+    "NOT ASSESSABLE": boundary.NOT_MEASURED,
 }
-OUR_FAULT, BAD_INPUT, INTERRUPTED = 1, 2, 130
 EXITS = (
     "Exit code: 0 PASS, 3 FAIL, 4 INCONCLUSIVE, 5 NOT MEASURED or NOT ASSESSABLE, 2 bad input, 1 an error of weldscan."
 )
 DEFAULT_NORM = "pnae-g-7-010-89"
-COLOURS = {Verdict.PASS: 32, Verdict.FAIL: 31, Verdict.INCONCLUSIVE: 33}
+COLOURS = {"PASS": 32, "FAIL": 31, "INCONCLUSIVE": 33}
 # PASS of a part of the seam, and what was not measured or cannot be assessed.
 PART_COLOUR, NO_COLOUR = 36, 35
 WHOLE_DEG = 360.0
@@ -255,6 +252,7 @@ def verify(
     from weldscan.records.history import append_history, check_history
     from weldscan.records.verification import is_verification
     from weldscan.report.verification import write_verification
+    from weldscan.result import Verdict
     from weldscan.verification import read_limits
     from weldscan.verification import verify as accept
     from weldscan.verification.history import with_drift
@@ -332,6 +330,7 @@ def _document(out: Path) -> None:
 def _summary(found: Inspection, out: Path) -> None:
     """A few lines: the verdict, what bars it, the value with its uncertainty, where, and the report's path."""
     from weldscan.report import judgement_text
+    from weldscan.result import Severity, Verdict
 
     def words(verdict: Verdict) -> str:
         part = verdict is Verdict.PASS and not found.whole
@@ -340,7 +339,7 @@ def _summary(found: Inspection, out: Path) -> None:
     step, headline = found.step, found.headline
     print(f"{words(found.verdict)}   {judgement_text(headline) if headline else 'no norm was asked'}")
     for finding in found.bars:
-        print(f"       {_coloured('bars PASS', COLOURS[Verdict.FAIL])}: {finding}")
+        print(f"       {_coloured('bars PASS', COLOURS['FAIL'])}: {finding}")
     if step is not None:
         print(
             f"       largest step {step.max_abs_mm:.3f} ± {step.expanded_uncertainty_mm:.3f} mm (k = 2) "
@@ -380,6 +379,8 @@ def _others(step: StepResult) -> str:
 
 def _told(found: Verification, out: Path, history: Path | None) -> None:
     """The verdict, a line per characteristic, what was lost, the drift, and where it all went."""
+    from weldscan.result import Verdict
+
     word = _coloured(found.verdict, COLOURS.get(found.verdict, NO_COLOUR))
     print(f"{word}   scanner {found.scanner}, {found.date}, valid until {found.valid_until}")
     for each in found.characteristics:
@@ -453,37 +454,5 @@ register_cell(app, _progress)
 
 
 def main() -> None:
-    """The entry point: whatever happens, one line and the exit code of the contract."""
-    terminal.prepare()
-    code: str | int | None
-    try:
-        app()
-    except SystemExit as ended:
-        code = ended.code
-    except KeyboardInterrupt:
-        code = _complain("interrupted; nothing was written", INTERRUPTED)
-    except NotMeasured as error:
-        code = _complain(error, EXIT_CODES[Verdict.NOT_MEASURED])
-    except WeldscanError as error:
-        code = _complain(error, BAD_INPUT)
-    except BrokenPipeError:
-        # Whoever read our output went away, and no verdict was due.
-        code = OUR_FAULT
-    except Exception as error:
-        if os.environ.get("WELDSCAN_TRACEBACK"):
-            with suppress(OSError):
-                traceback.print_exc()
-        code = _complain(
-            f"an error of weldscan itself: {type(error).__name__}: {error} (WELDSCAN_TRACEBACK=1 shows where)",
-            OUR_FAULT,
-        )
-    else:
-        code = None
-    terminal.settle()
-    if code is not None:
-        sys.exit(code)
-
-
-def _complain(message: object, code: int) -> int:
-    terminal.complain(f"weldscan: {' '.join(str(message).split())}")
-    return code
+    """The commands behind the error boundary; `weldscan.__main__`, the program, imports them inside it, too."""
+    boundary.run(app)

@@ -14,8 +14,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TextIO
 
-import typer
-
 ERRORS = "weldscan-plain"
 """The codec error handler by which a console that lacks a character gets plain ones for it."""
 PLAIN = {
@@ -79,13 +77,14 @@ def answer(code: int = 0) -> Iterator[None]:
     with suppress(OSError, UnicodeError):
         yield
     settle()
-    raise typer.Exit(code)
+    sys.exit(code)
 
 
 def complain(text: str) -> None:
     """A line on stderr, if anybody reads it."""
     with suppress(OSError):
-        print(text, file=sys.stderr, flush=True)
+        # In one piece with its line break: nothing comes between.
+        print(f"{text}\n", end="", file=sys.stderr, flush=True)
 
 
 def settle() -> None:

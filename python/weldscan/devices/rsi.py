@@ -68,6 +68,7 @@ class RsiRobot(Robot):
             [sys.executable, "-I", "-S", rsi_answer.__file__, *map(str, words), str(self._reports.getsockname()[1])],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            process_group=0,  # Ctrl-C is for the scan, also while this one starts
             text=True,
         )
         said = self._process.stdout.readline().split(maxsplit=2)  # type: ignore[union-attr]

@@ -50,6 +50,7 @@ class WindowProjector(Projector):
             [sys.executable, "-m", __name__, *numbers],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            process_group=0,  # Ctrl-C is for the scan, also while this one starts
             bufsize=0,
             env={**os.environ, "PYGAME_HIDE_SUPPORT_PROMPT": "1"},
         )

@@ -260,6 +260,9 @@ class whole_folder:
             shutil.rmtree(self.partial, ignore_errors=True)
         if isinstance(error, OSError) and error.errno in CANNOT_WRITE:
             raise InputError(f"{self.path}: cannot be written: {_reason(error)}") from error
+        if isinstance(error, InputError) and str(self.partial) in str(error):
+            # What was to be written inside is named by the place where it was to be.
+            raise InputError(str(error).replace(str(self.partial), str(self.path))) from error
 
     def _swap(self) -> None:
         """Moves the old folder aside, the new one in, and only then removes the old."""

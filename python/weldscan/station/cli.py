@@ -19,13 +19,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from weldscan import terminal
+from weldscan.boundary import NOT_MEASURED
 from weldscan.devices import BACKENDS, backend
 from weldscan.errors import DeviceError, InputError
-from weldscan.pose import KukaPose
 
 if TYPE_CHECKING:
     from weldscan.devices.controller import Arm, Controller
     from weldscan.devices.robot import Robot, StampedPose
+    from weldscan.pose import KukaPose
     from weldscan.records.session import ShotSpec
 
 
@@ -52,7 +53,6 @@ def _silent() -> Iterator[Tell]:
 
 
 _progress: Progress = _silent
-NOT_MEASURED, INTERRUPTED = 5, 130
 
 
 def register(app: typer.Typer, progress: Progress = _silent) -> None:
@@ -136,9 +136,9 @@ def robot_simulate(
         for request in fault or []:
             _inject(controller, request.replace(":", " "))
         where = {} if link == "serial" else {"host": host}
-        print(json.dumps({"link": link, **where, "port": controller.port}), flush=True)
-        threading.Thread(target=_obey_lines, args=(controller,), daemon=True).start()
         with contextlib.suppress(KeyboardInterrupt):
+            print(json.dumps({"link": link, **where, "port": controller.port}), flush=True)
+            threading.Thread(target=_obey_lines, args=(controller,), daemon=True).start()
             threading.Event().wait()
 
 
@@ -263,8 +263,6 @@ def scan(
     At each pose of the plan: move there, or wait for the operator; wait until the robot stands; take the images between
     two readings of the pose; look at their quality; keep the shot. What was kept stays, whatever happens next.
     """
-    import signal
-
     from weldscan.station.cell import read_cell
     from weldscan.station.scan import scan as run
 
@@ -276,17 +274,12 @@ def scan(
     if out is None:
         raise InputError("--out: name the session folder")
 
-    def stop(_number: int, _frame: object) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, stop)
     how = f"weldscan scan --config {config} --out {out} --resume"
     try:
         with _progress() as tell:
             result = run(read_cell(config), out, resume, tell, _ask_the_operator)
     except KeyboardInterrupt:
-        terminal.complain(f"weldscan: stopped; what was kept is whole. To go on: {how}")
-        raise typer.Exit(INTERRUPTED) from None
+        raise KeyboardInterrupt(f"stopped; what was kept is whole. To go on: {how}") from None
     complete = result.whole >= result.planned
     with terminal.answer(0 if complete else NOT_MEASURED):
         print(f"{result.whole} of {result.planned} shots in {out}")
@@ -355,6 +348,8 @@ def _inject(controller: Controller, request: str) -> None:
 
 
 def _pose(words: list[str]) -> KukaPose:
+    from weldscan.pose import KukaPose
+
     try:
         values = [float(word) for word in words]
     except ValueError:

@@ -14,6 +14,7 @@ from weldscan.devices.kvp import KvpController
 from weldscan.devices.simulated import DEFAULT, Cell, session_document
 from weldscan.errors import InputError, NotMeasured
 from weldscan.pose import KukaPose
+from weldscan.records.files import write_file
 from weldscan.station.cell import CellConfig
 from weldscan.station.scan import scan
 
@@ -104,13 +105,14 @@ def write_example(folder: Path, cell: Cell = DEFAULT) -> str:
         width=projector.width,
         height=projector.height,
     )
+    files = {folder / "cell.toml": text, folder / "plan.json": json.dumps(plan, indent=1) + "\n"}
+    for file in files:
+        if file.exists() or file.is_symlink():
+            raise InputError(f"{file}: exists already; name another folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, content in (("cell.toml", text), ("plan.json", json.dumps(plan, indent=1) + "\n")):
-            with (folder / name).open("x", encoding="utf-8") as file:
-                file.write(content)
-    except FileExistsError as error:
-        raise InputError(f"{error.filename}: exists already; name another folder") from None
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror or error}") from None
+    for file, content in files.items():
+        write_file(file, content)
     return "\n".join(line.removeprefix("# ") for line in text.splitlines()[:7])

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from test_simulate import small_scanner
-from weldscan.cli import main
 from weldscan.devices.simulated import DEFAULT, simulate_session
+from weldscan.faces.cli.app import main
 
 CELL = replace(DEFAULT, scanner=small_scanner(2), artefact_shots=2)
 WIDTH, HEIGHT = CELL.scanner.camera.width, CELL.scanner.camera.height

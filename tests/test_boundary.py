@@ -15,8 +15,9 @@ from pathlib import Path
 
 import pytest
 
-from weldscan import DeviceError, GeometryError, InputError, NotMeasured, boundary
+from weldscan import DeviceError, GeometryError, InputError, NotMeasured
 from weldscan.devices.simulated import DEFAULT, simulate_session
+from weldscan.faces.cli import boundary
 
 START = """
 import os, signal, sys
@@ -108,7 +109,10 @@ except BaseException:
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
 def test_an_interrupt_never_falls_into_an_import(tmp_path, number):
     (tmp_path / "swallows.py").write_text(SWALLOWS.format(number=number))
-    run = "from weldscan import boundary; import time; boundary.run(lambda: (__import__('swallows'), time.sleep(30)))"
+    run = (
+        "from weldscan.faces.cli import boundary; import time; "
+        "boundary.run(lambda: (__import__('swallows'), time.sleep(30)))"
+    )
     done = subprocess.run(
         [sys.executable, "-c", run], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=20
     )
@@ -127,9 +131,9 @@ def test_an_interrupt_never_falls_into_an_import(tmp_path, number):
     ],
 )
 def test_an_interrupt_is_not_lost(body):
-    run = f"import os, signal, time, weldscan, weldscan.boundary\ndef command():\n    {body}\n"
+    run = f"import os, signal, time, weldscan, weldscan.faces.cli.boundary\ndef command():\n    {body}\n"
     done = subprocess.run(
-        [sys.executable, "-c", run + "weldscan.boundary.run(command)"],
+        [sys.executable, "-c", run + "weldscan.faces.cli.boundary.run(command)"],
         capture_output=True,
         text=True,
         check=False,
@@ -139,7 +143,7 @@ def test_an_interrupt_is_not_lost(body):
 
 
 def test_a_reader_that_hangs_is_not_waited_for():
-    run = "from weldscan import boundary; boundary.run(lambda: print('ready\\n', 'x' * 2_000_000))"
+    run = "from weldscan.faces.cli import boundary; boundary.run(lambda: print('ready\\n', 'x' * 2_000_000))"
     process = subprocess.Popen([sys.executable, "-c", run], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     process.stdout.read(5)
     for _ in range(100):  # the first ends the command, the next the flush

@@ -468,7 +468,7 @@ def test_a_live_cell_is_captured_and_calibrated(tmp_path, monkeypatch, capsys):
     """The project's own simulator renders the board, projector and camera are devices, an operator moves the board."""
     import io
 
-    from weldscan.cli import main
+    from weldscan.faces.cli.app import main
 
     (tmp_path / "cell.toml").write_text(CELL)
     out = tmp_path / "scanner.json"
@@ -492,7 +492,7 @@ def test_a_live_cell_is_captured_and_calibrated(tmp_path, monkeypatch, capsys):
 def test_a_live_capture_without_an_operator_keeps_nothing(tmp_path, monkeypatch):
     import io
 
-    from weldscan.cli import main
+    from weldscan.faces.cli.app import main
 
     (tmp_path / "cell.toml").write_text(CELL)
     monkeypatch.setattr("sys.stdin", io.StringIO(""))

@@ -14,8 +14,8 @@ import pytest
 
 from synthetic import barred, inspection, nothing_measured
 from weldscan import GeometryError, InputError, NotMeasured
-from weldscan.cli import main
-from weldscan.terminal import plain_ascii
+from weldscan.faces.cli.app import main
+from weldscan.faces.cli.terminal import plain_ascii
 
 
 @pytest.fixture
@@ -127,7 +127,7 @@ def test_progress_is_json_lines_where_there_is_no_terminal(monkeypatch, capsys, 
 def test_version_and_help():
     def said(*arguments):
         return subprocess.run(
-            [sys.executable, "-c", "from weldscan.cli import main; main()", *arguments],
+            [sys.executable, "-c", "from weldscan.faces.cli.app import main; main()", *arguments],
             capture_output=True,
             text=True,
             check=True,
@@ -141,7 +141,7 @@ def test_version_and_help():
 def test_help_does_not_import_what_it_does_not_need():
     script = """
 import sys
-from weldscan.cli import main
+from weldscan.faces.cli.app import main
 sys.argv = ["weldscan", "--help"]
 try:
     main()
@@ -191,7 +191,7 @@ if "verify" in sys.argv:
     from test_verification import made_up
     weldscan.verification.verify = lambda *_, progress, **__: (progress(1, 2, "measuring"), made_up())[1]
     weldscan.report.verification.write_verification = lambda found, out: (out.mkdir(), (out / "v.json").touch())
-from weldscan.cli import main
+from weldscan.faces.cli.app import main
 main()
 """
 
@@ -254,7 +254,13 @@ def test_a_verdict_without_a_reader_is_the_same(tmp_path, command, scale, code, 
 def test_a_complaint_without_a_reader_keeps_its_code(tmp_path):
     reader, writer = os.pipe()
     os.close(reader)
-    arguments = [sys.executable, "-c", "from weldscan.cli import main; main()", "inspect", str(tmp_path / "none")]
+    arguments = [
+        sys.executable,
+        "-c",
+        "from weldscan.faces.cli.app import main; main()",
+        "inspect",
+        str(tmp_path / "none"),
+    ]
     assert subprocess.run(arguments, stdout=writer, stderr=writer, check=False).returncode == 2
     os.close(writer)
 

@@ -17,7 +17,7 @@ import pytest
 
 import weldscan as ws
 from synthetic import hand_eye
-from weldscan.cli import main
+from weldscan.faces.cli.app import main
 
 DATA = Path(__file__).parent / "data" / "documents-281640f"
 MOVED = Path(__file__).parents[1] / "docs" / "moved.csv"

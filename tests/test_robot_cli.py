@@ -11,12 +11,12 @@ from typer.testing import CliRunner
 
 from weldscan import DeviceError, InputError
 from weldscan.devices.controller import Arm
+from weldscan.faces.cli.station import _controller, register
 from weldscan.station.cell import read_cell
-from weldscan.station.cli import _controller, register
 
 MAIN = (  # a test that runs in the background has Ctrl-C switched off, and its children with it
     "import signal, typer; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    "from weldscan.station.cli import register; app = typer.Typer(); register(app); app()"
+    "from weldscan.faces.cli.station import register; app = typer.Typer(); register(app); app()"
 )
 POSE = "610.825 -148.476 481.652 -29.008 23.236 74.641"
 

@@ -38,7 +38,8 @@ WIDTH, HEIGHT = 48, 32
 FRINGES = [("x", 1, 4), ("x", 4, 4)]
 IMAGES = 9
 MAIN = (  # a test that runs in the background has Ctrl-C switched off, and its children with it
-    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from weldscan.cli import main; main()"
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "from weldscan.faces.cli.app import main; main()"
 )
 POSES = {
     "artefact-1": (600.0, -150.0, 480.0, -29.0, 23.0, 74.0),
@@ -686,7 +687,7 @@ def test_device_timeouts_are_device_errors():
 
 def test_the_example_cell(tmp_path):
     """What `--example-config` writes is scanned as it stands, but for the port; two shots of its eight."""
-    from weldscan.station.live import write_example
+    from weldscan.faces.live_demo import write_example
 
     said = write_example(tmp_path / "cell")
     path, plan = tmp_path / "cell" / "cell.toml", tmp_path / "cell" / "plan.json"
@@ -714,7 +715,7 @@ def test_the_live_cell(tmp_path):
 
     from weldscan import Lens
     from weldscan.devices.simulated import DEFAULT, make_scanner, render, session_document
-    from weldscan.station.live import record_live
+    from weldscan.faces.live_demo import record_live
 
     lens = Lens(160, 120, [[326.0, 0, 80.0], [0, 326.0, 60.0], [0, 0, 1]], [0.0, 0.0, 0.0, 0.0])
     projector = Lens(160, 100, [[260.0, 0, 80.0], [0, 260.0, 50.0], [0, 0, 1]], [0.0, 0.0, 0.0, 0.0])

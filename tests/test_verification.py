@@ -759,7 +759,7 @@ def test_inspect_judges_only_with_a_verified_scanner(session, tmp_path):
 
 
 def weldscan(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", "from weldscan.cli import main; main()", *map(str, arguments)]
+    command = [sys.executable, "-c", "from weldscan.faces.cli.app import main; main()", *map(str, arguments)]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 

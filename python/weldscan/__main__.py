@@ -6,7 +6,7 @@ import os
 def main() -> None:
     """The entry point: whatever happens, at most one line of complaint, and the exit code of the contract."""
     try:
-        from weldscan import boundary  # an interrupt may fall into this import already
+        from weldscan.faces.cli import boundary  # an interrupt may fall into this import already
 
         boundary.run(_commands)
     except KeyboardInterrupt:  # before the boundary stood
@@ -17,7 +17,7 @@ def main() -> None:
 
 
 def _commands() -> None:
-    from weldscan.cli import app
+    from weldscan.faces.cli.app import app
 
     app()
 

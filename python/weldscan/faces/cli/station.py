@@ -1,6 +1,6 @@
 """The commands of the live cell: robot, camera, project, devices, scan. `register` adds them to the command line.
 
-As in `weldscan.cli`, heavy imports happen inside the commands.
+As in `weldscan.faces.cli.app`, heavy imports happen inside the commands.
 """
 
 from __future__ import annotations
@@ -11,17 +11,16 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from weldscan import terminal
-from weldscan.boundary import NOT_MEASURED
 from weldscan.devices import BACKENDS, backend
 from weldscan.errors import DeviceError, InputError
+from weldscan.faces.cli import terminal
+from weldscan.faces.cli.boundary import NOT_MEASURED
+from weldscan.faces.cli.progress import shown_progress
 
 if TYPE_CHECKING:
     from weldscan.devices.controller import Arm, Controller
@@ -43,22 +42,8 @@ CELL = Path("cell.toml")
 MODES = ("#T1", "#T2", "#AUT", "#EX")
 
 
-Tell = Callable[[int, int, str], None]
-Progress = Callable[[], AbstractContextManager[Tell]]
-
-
-@contextmanager
-def _silent() -> Iterator[Tell]:
-    yield lambda done, of, what: None
-
-
-_progress: Progress = _silent
-
-
-def register(app: typer.Typer, progress: Progress = _silent) -> None:
-    """Add the commands of the live cell; `progress` gives what shows how far a scan is."""
-    global _progress  # noqa: PLW0603 - set once, when the command line is put together
-    _progress = progress
+def register(app: typer.Typer) -> None:
+    """Add the commands of the live cell."""
     app.add_typer(robot_app, name="robot")
     app.add_typer(camera_app, name="camera")
     app.add_typer(devices_app, name="devices")
@@ -267,7 +252,7 @@ def scan(
     from weldscan.station.scan import scan as run
 
     if example_config is not None:
-        from weldscan.station.live import write_example
+        from weldscan.faces.live_demo import write_example
 
         print(write_example(example_config))
         return
@@ -276,7 +261,7 @@ def scan(
 
     how = f"weldscan scan --config {config} --out {out} --resume"
     try:
-        with _progress() as tell:
+        with shown_progress() as tell:
             result = run(read_cell(config), out, resume, tell, _ask_the_operator)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"stopped; what was kept is whole. To go on: {how}") from None

@@ -1,54 +1,32 @@
 """`weldscan calibrate ...`: the calibrations that are kept and used again. `register` adds them to the command line.
 
-As in `weldscan.cli`, heavy imports happen inside the commands.
+As in `weldscan.faces.cli.app`, heavy imports happen inside the commands.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from weldscan import terminal
 from weldscan.errors import InputError
+from weldscan.faces.cli import terminal
+from weldscan.faces.cli.progress import Progress, shown_progress
 
 if TYPE_CHECKING:
     from weldscan.calibration.plan import Plan
     from weldscan.records.response import Response
     from weldscan.result import HandEye, ScannerCalibration
 
-Tell = Callable[[int, int, str], None]
-Progress = Callable[[], AbstractContextManager[Tell]]
-
 calibrate = typer.Typer(
     help="Calibrations that are kept and used again.", no_args_is_help=True, rich_markup_mode=None, add_completion=False
 )
 
 
-@contextmanager
-def _silent() -> Iterator[Tell]:
-    yield lambda done, of, what: None
-
-
-Capture = Callable[[Path, Path, str | None, Tell], None]
-"""Captures a board by a cell's devices: cell.toml, the folder to make, the board, progress."""
-
-
-def _no_devices(config: Path, folder: Path, board: str | None, tell: Tell) -> None:
-    raise InputError("--live: this program has no devices")
-
-
-_progress: Progress = _silent
-_capture: Capture = _no_devices
-
-
-def register(app: typer.Typer, progress: Progress = _silent, capture: Capture = _no_devices) -> None:
-    """Add `calibrate`; `progress` gives what shows how far a calibration is, `capture` what `--live` does."""
-    global _progress, _capture
-    _progress, _capture = progress, capture
+def register(app: typer.Typer) -> None:
+    """Add `calibrate`."""
     app.add_typer(calibrate, name="calibrate")
 
 
@@ -78,7 +56,7 @@ def hand_eye(
     page = page if page is not None else out.with_suffix(".html")
     check_page(page)
     left_out: list[tuple[str, str]] = []
-    with _progress() as progress:
+    with shown_progress() as progress:
         found = solve(session, progress, left_out)
     write_hand_eye(out, found)
     write_hand_eye_page(found, page, session.resolve().name)
@@ -142,7 +120,7 @@ def plan(
     if mount is not None and hand_eye is not None:
         raise InputError("--mount and --hand-eye: only one of them")
     given = read_source(source)
-    with _progress() as progress:
+    with shown_progress() as progress:
         progress(0, 2, "where the scanner sits")
         if mount is not None:
             where = planning.mount_of(mount)
@@ -264,9 +242,9 @@ def scanner(
     check_page(page)
     if board is not None:
         parse_board(board)
-    with _progress() as progress:
+    with shown_progress() as progress:
         if live:
-            _capture(config, folder, board, progress)
+            _capture_board(config, folder, board, progress)
         found = calibrate_scanner(
             folder,
             board,
@@ -280,6 +258,19 @@ def scanner(
     write_scanner_page(found, page)
     with terminal.answer():
         _say(found, out, page)
+
+
+def _capture_board(config: Path, folder: Path, board: str | None, progress: Progress) -> None:
+    """What `calibrate scanner --live` does before it calibrates."""
+    from weldscan.station.board import capture_board
+    from weldscan.station.cell import read_cell
+
+    def ask(what: str) -> None:
+        print(f"{what}, then press Enter.", file=sys.stderr, flush=True)
+        if not sys.stdin.readline():
+            raise InputError("--live: nobody is there to press Enter")
+
+    capture_board(read_cell(config), folder, board, progress, ask)
 
 
 def _say(found: ScannerCalibration, out: Path, page: Path) -> None:
@@ -348,7 +339,7 @@ def response(
     from weldscan.report.response import response_svg
 
     sets = None if fringes is None else parse_fringes(fringes)
-    with _progress() as progress:
+    with shown_progress() as progress:
         progress(0, 1, f"reading {folder}")
         found = response_of_folder(folder, sets, shot=shot)
     write_response(out, found)

@@ -52,7 +52,7 @@ def run(command: Callable[[], object]) -> NoReturn:
     try:
         try:
             stop.raises = True
-            from weldscan import terminal
+            from weldscan.faces.cli import terminal
 
             terminal.prepare()
             command()
@@ -62,7 +62,7 @@ def run(command: Callable[[], object]) -> NoReturn:
         stop.raises = False  # an interrupt may have come between
         code, said = _told(error, stop.struck)
     # The error and all that its frames held are gone here: after a MemoryError there is room again.
-    from weldscan import terminal
+    from weldscan.faces.cli import terminal
 
     if said is not None:
         stop.said = True

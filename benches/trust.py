@@ -26,8 +26,8 @@ def _one(job: tuple[str, int, bool]) -> dict:
     import weldscan
     from weldscan.devices import scenes
     from weldscan.errors import WeldscanError
-    from weldscan.inspection import inspect
-    from weldscan.points import MASKS, PointReader, Scan
+    from weldscan.measure.inspection import inspect
+    from weldscan.measure.session_points import MASKS, PointReader, Scan
 
     weldscan.set_threads(1)
     kind, seed, images = job

@@ -13,10 +13,10 @@ import pytest
 
 from conftest import shared
 from test_description import CELL, Change, copied, of, pose_of
-from weldscan.agreement import _unlike, copies
-from weldscan.calibration.hand_eye import calibrate
 from weldscan.devices.simulated import Wall, Weld, pipe, placed, simulate_session
-from weldscan.inspection import inspect
+from weldscan.measure.inspection import inspect
+from weldscan.measure.session_hand_eye import calibrate
+from weldscan.measure.shot_agreement import _unlike, copies
 from weldscan.records.hand_eye import write_hand_eye
 from weldscan.result import Severity
 

@@ -11,7 +11,8 @@ import pytest
 from weldscan import Lens, Scanner
 from weldscan._weldcore import triangulate
 from weldscan.calibration.bundle import K3, PARAMETERS, rotation
-from weldscan.calibration_margin import (
+from weldscan.devices.scenes import scanner_for
+from weldscan.measure.calibration_margin import (
     NOISE_PX,
     CalibrationMargin,
     Unevenness,
@@ -21,8 +22,7 @@ from weldscan.calibration_margin import (
     step_jacobians,
     working_distance_mm,
 )
-from weldscan.devices.scenes import scanner_for
-from weldscan.part_views import PartView
+from weldscan.measure.part_views import PartView
 from weldscan.records.scanner import CovarianceSpec
 from weldscan.result import Label, Severity
 

@@ -20,7 +20,7 @@ from weldscan.faces.cli.terminal import plain_ascii
 
 @pytest.fixture
 def run(monkeypatch, capsys, tmp_path):
-    """Runs a command with `weldscan.inspection.inspect` replaced; gives exit code, stdout, stderr without progress."""
+    """Runs a command with what `inspect` calls replaced; gives exit code, stdout, stderr without progress."""
 
     def run(*arguments: str, finds=None):
         def inspect(session_folder, *, method, norms, progress, response="auto", **asked):
@@ -30,9 +30,9 @@ def run(monkeypatch, capsys, tmp_path):
                 raise finds
             return replace(finds, method=method)
 
-        fake = types.ModuleType("weldscan.inspection")
+        fake = types.ModuleType("weldscan.measure.inspection")
         fake.inspect = inspect
-        monkeypatch.setitem(sys.modules, "weldscan.inspection", fake)
+        monkeypatch.setitem(sys.modules, "weldscan.measure.inspection", fake)
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", ["weldscan", *map(str, arguments)])
         with pytest.raises(SystemExit) as exit_:
@@ -183,9 +183,9 @@ SCRIPT = """
 import sys, types
 sys.path.insert(0, {tests!r})
 from synthetic import inspection
-fake = types.ModuleType("weldscan.inspection")
+fake = types.ModuleType("weldscan.measure.inspection")
 fake.inspect = lambda *_, progress, **__: (progress(1, 2, "measuring"), inspection(500, scale={scale}))[1]
-sys.modules["weldscan.inspection"] = fake
+sys.modules["weldscan.measure.inspection"] = fake
 if "verify" in sys.argv:
     import weldscan.report.verification, weldscan.verification
     from test_verification import made_up

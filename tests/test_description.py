@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 from test_simulate import small_scanner
-from weldscan.description import held_against_itself
 from weldscan.devices.simulated import DEFAULT, pipe, session_document, simulate_session
-from weldscan.inspection import inspect
+from weldscan.measure.inspection import inspect
+from weldscan.measure.stated_and_found import held_against_itself
 from weldscan.records.session import Session
 from weldscan.records.shot import faults
 from weldscan.result import Finding, Inspection, Severity, Verdict
@@ -214,7 +214,7 @@ def test_a_pose_out_of_this_world_bars_and_takes_no_memory(
     session = copied(recorded["630"], tmp_path / "session", lambda d: pose_of(d, "part-2").update(X=x_mm))
     # VmHWM is this process's own peak; ru_maxrss would begin at that of the process that started it.
     code = (
-        "import re, sys; from pathlib import Path; from weldscan.inspection import inspect; "
+        "import re, sys; from pathlib import Path; from weldscan.measure.inspection import inspect; "
         "found = inspect(sys.argv[1]); "
         "peak = re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text()); "
         "print(sorted({bar.code for bar in found.bars}), peak.group(1))"

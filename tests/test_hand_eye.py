@@ -20,15 +20,14 @@ from weldscan.calibration.hand_eye import (
     POSE_SIGMA_MM,
     POSE_SIGMA_RAD,
     TOUCH_BIAS_SIGMA_MM,
-    _kept,
-    calibrate,
     point_covariance,
     pose_sigma,
     solve_hand_eye,
-    write_hand_eye,
 )
 from weldscan.devices.simulated import DEFAULT, placed, simulate_session, tilted_views
 from weldscan.errors import GeometryError, InputError
+from weldscan.measure.session_hand_eye import calibrate
+from weldscan.records.hand_eye import write_hand_eye
 from weldscan.report.hand_eye import write_hand_eye_page
 from weldscan.result import HandEye
 
@@ -487,6 +486,7 @@ def test_a_kept_calibration_says_what_the_robot_is_like(tmp_path):
     found = solve_hand_eye(*drawn(6, SHAKY, np.random.default_rng(9)))
     kept = write_hand_eye(tmp_path / "hand-eye.json", found)
     assert kept.pose_sigma_mm == found.pose_sigma_mm and kept.working_point_u_mm == found.working_point_u_mm
-    assert pose_sigma(_kept(kept)) == (found.pose_sigma_mm, found.pose_sigma_rad)
+    assert pose_sigma(kept.build()) == (found.pose_sigma_mm, found.pose_sigma_rad)
     older = kept.model_copy(update={"pose_sigma_mm": None, "working_point_u_mm": None})
-    assert np.isnan(_kept(older).working_point_u_mm) and pose_sigma(_kept(older)) == (POSE_SIGMA_MM, POSE_SIGMA_RAD)
+    assert np.isnan(older.build().working_point_u_mm)
+    assert pose_sigma(older.build()) == (POSE_SIGMA_MM, POSE_SIGMA_RAD)

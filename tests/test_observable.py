@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from weldscan.observable import ANGLE_PRIOR_DEG, DIAMETER_PRIOR, OFFSET_PRIOR, seam_terms
+from weldscan.measure.observable_terms import ANGLE_PRIOR_DEG, DIAMETER_PRIOR, OFFSET_PRIOR, seam_terms
 
 STEP = {
     "radius_difference_mm": (0.2, 0.01),

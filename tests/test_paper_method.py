@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from weldscan.errors import GeometryError
-from weldscan.paper_method import KEPT_PART, MODEL_SPACING_MM, histogram_step, modelled_pipe, paper_step
+from weldscan.measure.paper_method import KEPT_PART, MODEL_SPACING_MM, histogram_step, modelled_pipe, paper_step
 
 RADIUS_MM = 315.0
 POINT = np.array([900.0, 40.0, 300.0])

@@ -10,8 +10,8 @@ import pytest
 
 from conftest import shared
 from weldscan.devices import scenes
-from weldscan.inspection import inspect
-from weldscan.points import MASKS, PointReader, Scan
+from weldscan.measure.inspection import inspect
+from weldscan.measure.session_points import MASKS, PointReader, Scan
 from weldscan.result import FATES, Verdict
 
 MUST_NOT_PASS = {

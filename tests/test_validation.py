@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from conftest import shared
-from weldscan import InputError, NotMeasured, validation
+from weldscan import InputError, NotMeasured
 from weldscan.report.validation import write_validation
 from weldscan.result import BudgetLine, Label, PartCloud
+from weldscan.verification import validation
 
 RADIUS, NOISE_MM, PROBE_MM = 136.6, 0.03, 0.015
 # Quadric through some 280 points with this noise: 0.03 * 3 / sqrt(280) is 0.005 mm; the sagitta of the patch that a

@@ -21,6 +21,7 @@ from conftest import shared
 from test_simulate import small_scanner
 from weldscan import GeometryError, InputError, Verdict, inspect
 from weldscan.devices.simulated import DEFAULT, simulate_session
+from weldscan.measure.scanner_standing import scanner_id, standing_of
 from weldscan.records.history import append_history, check_history, read_history
 from weldscan.records.session import read_session
 from weldscan.result import Characteristic, Verification
@@ -32,10 +33,9 @@ from weldscan.verification import (
     places,
     probing_error,
     read_limits,
-    scanner_id,
     verify,
 )
-from weldscan.verification.history import slope, standing_of, with_drift
+from weldscan.verification.history import slope, with_drift
 from weldscan.verification.standards import caps
 
 # Sums of some thousand coordinates of 500 mm in double precision.

@@ -60,9 +60,10 @@ if TYPE_CHECKING:
     from weldscan.calibration.response import compensate_phase, estimate_response, response_of_folder, response_of_ramp
     from weldscan.calibration.scanner import BoardView, calibrate_scanner, solve_scanner
     from weldscan.errors import DeviceError, DeviceTimeout, GeometryError, InputError, NotMeasured, WeldscanError
-    from weldscan.inspection import inspect
+    from weldscan.measure.inspection import inspect
+    from weldscan.measure.paper_method import paper_step
+    from weldscan.measure.scanner_standing import standing_of
     from weldscan.norms import judge, limit_mm, norm_ids
-    from weldscan.paper_method import paper_step
     from weldscan.pose import (
         KukaPose,
         format_e6axis,
@@ -84,9 +85,8 @@ if TYPE_CHECKING:
     from weldscan.report.validation import write_validation
     from weldscan.report.verification import write_verification
     from weldscan.result import Inspection, Label, ScannerCalibration, Standing, Validation, Verdict, Verification
-    from weldscan.validation import validate
     from weldscan.verification import VerificationLimits, flatness_error, probing_error, read_limits, verify
-    from weldscan.verification.history import standing_of
+    from weldscan.verification.validation import validate
 
 # Names are imported when they are asked for: a command is to stand behind its error boundary before anything heavy is
 # loaded, and an algorithm needs neither pydantic nor OpenCV. What is in none of these is the core's.
@@ -100,8 +100,8 @@ _LAZY = {
     ),
     "weldscan.calibration.scanner": ("BoardView", "calibrate_scanner", "solve_scanner"),
     "weldscan.errors": ("DeviceError", "DeviceTimeout", "GeometryError", "InputError", "NotMeasured", "WeldscanError"),
-    "weldscan.inspection": ("inspect",),
-    "weldscan.paper_method": ("paper_step",),
+    "weldscan.measure.inspection": ("inspect",),
+    "weldscan.measure.paper_method": ("paper_step",),
     "weldscan.norms": ("judge", "limit_mm", "norm_ids"),
     "weldscan.pose": (
         "KukaPose",
@@ -132,9 +132,9 @@ _LAZY = {
         "Verdict",
         "Verification",
     ),
-    "weldscan.validation": ("validate",),
+    "weldscan.verification.validation": ("validate",),
     "weldscan.verification": ("VerificationLimits", "flatness_error", "probing_error", "read_limits", "verify"),
-    "weldscan.verification.history": ("standing_of",),
+    "weldscan.measure.scanner_standing": ("standing_of",),
 }
 
 

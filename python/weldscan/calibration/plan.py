@@ -13,9 +13,7 @@ Source: V. V. Fedorov, Theory of Optimal Experiments (1972), 3.3, for the exchan
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +24,12 @@ from weldscan.calibration.hand_eye import (
     POSE_SIGMA_MM,
     POSE_SIGMA_RAD,
     TOUCH_BIAS_SIGMA_MM,
-    calibrate,
     inverse,
     tilts_rad,
 )
 from weldscan.calibration.hand_eye_model import FACTORS, UNKNOWNS, Linear, Noise, skew
 from weldscan.errors import InputError
 from weldscan.pose import KukaPose, matrix_from_kuka
-from weldscan.records.hand_eye import named_hand_eye
 from weldscan.records.plan import NAME, PlanSource
 from weldscan.records.session import FlangePose, Session, ShotSpec
 
@@ -111,20 +107,6 @@ class Plan:
     centres_base_mm: Floats
     noise: Noise
     limits: Limits
-
-
-def mounted(source: PlanSource, path: str | os.PathLike[str]) -> Floats:
-    """flange_from_scanner as the source has it: its hand-eye, or the one that its artefact shots give."""
-    path = Path(path)
-    if source.hand_eye is not None:
-        file = path / "session.json" if path.is_dir() else path
-        return np.array(named_hand_eye(file, source.hand_eye).flange_from_scanner)
-    if path.is_dir() and any(shot.of == "artefact" for shot in source.shots):
-        return calibrate(path).flange_from_scanner
-    raise InputError(
-        f"{path}: hand_eye: missing; say roughly where the scanner sits on the flange with --mount 'X Y Z A B C' "
-        "(mm and degrees, the drawing's are good enough) or --hand-eye FILE"
-    )
 
 
 def noise_of(source: PlanSource) -> Noise:

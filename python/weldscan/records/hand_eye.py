@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
 from weldscan.errors import InputError
@@ -41,6 +43,28 @@ class HandEyeSpec(Model):
     warnings: tuple[str, ...] = ()
     per_shot: tuple[dict[str, Any], ...] = ()
     """For the record; nothing reads it."""
+
+    def build(self) -> HandEye:
+        """The calibration that it describes; its shots are not kept."""
+        return HandEye(
+            flange_from_scanner=np.array(self.flange_from_scanner),
+            covariance=np.array(self.covariance),
+            residual_rms_mm=self.residual_rms_mm,
+            per_shot=(),
+            touched_distances_mm=np.array(self.touched_distances_mm or ()),
+            reduced_chi2=self.reduced_chi2,
+            working_point_u_mm=math.nan if self.working_point_u_mm is None else self.working_point_u_mm,
+            id=self.id,
+            date=self.date,
+            pose_sigma_mm=self.pose_sigma_mm,
+            pose_sigma_rad=self.pose_sigma_rad,
+            sphere_sigma_ratio=self.sphere_sigma_ratio,
+            centres_base_mm=None if self.centres_base_mm is None else np.array(self.centres_base_mm),
+            probe_bias_mm=None if self.probe_bias_mm is None else np.array(self.probe_bias_mm),
+            probe_bias_u_mm=None if self.probe_bias_u_mm is None else np.array(self.probe_bias_u_mm),
+            tilts_deg=self.tilts_deg or (0.0, 0.0),
+            warnings=self.warnings,
+        )
 
 
 def read_hand_eye(path: str | os.PathLike[str]) -> HandEyeSpec:

@@ -9,13 +9,11 @@ Each at every position that the session has; the one furthest from zero is judge
 guard band of ISO 14253-1. Every pixel that looks at the standard counts: what the scanner gave a point for is part of
 the result, however far off. What the standard is - which pixels look at it - is decided by geometry alone.
 
-`history.py` keeps what was found.
+`history.py` tells how it changes.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import os
 import platform
@@ -28,11 +26,11 @@ from numpy.typing import NDArray
 
 from weldscan._weldcore import __version__
 from weldscan.calibration.artefact import PlateMismatch
-from weldscan.calibration.hand_eye import base_from_flange
 from weldscan.errors import GeometryError, InputError
-from weldscan.points import PointReader, Progress
+from weldscan.measure.scanner_standing import CLOCK_SKEW, fringes_of, scanner_id
+from weldscan.measure.session_hand_eye import base_from_flange
+from weldscan.measure.session_points import PointReader, Progress
 from weldscan.records.fields import moment
-from weldscan.records.scanner import ScannerSpec
 from weldscan.records.session import Session, read_session
 from weldscan.records.shot import left_out, read_manifest
 from weldscan.result import BallError, Characteristic, PlaneError, SpacingError, Verdict, Verification, warning
@@ -48,7 +46,6 @@ __all__ = [
     "noise_range",
     "probing_error",
     "read_limits",
-    "scanner_id",
     "verify",
 ]
 
@@ -71,7 +68,6 @@ BALL_DIAMETER_U_MM = 0.005
 PLANE_FLATNESS_MM = 0.005
 # VDI/VDE 2634 part 2, from memory: the plane's length as a share of the volume's diagonal.
 HALF_FIELD = 0.5
-CLOCK_SKEW = timedelta(minutes=10)
 
 
 def places(anchors: Sequence[Floats], apart_mm: float) -> int:
@@ -166,21 +162,6 @@ def _other_ranges(standards: Sequence[BallError | PlaneError], judged: float) ->
     if wild:
         parts.append(f"{wild} of {sum(each.points for each in standards)} points far off the surface")
     return f"judged over {100 * judged:g} % of the points; {', '.join(parts)}"
-
-
-def scanner_id(scanner: ScannerSpec) -> str:
-    """Identifies a calibrated scanner: a hash of its numbers, so that a new calibration is another scanner."""
-    numbers = {
-        name: [lens.width, lens.height, lens.K, [*lens.dist, 0.0][:5]]
-        for name, lens in (("camera", scanner.camera), ("projector", scanner.projector))
-    }
-    text = json.dumps({**numbers, "pose": scanner.camera_from_projector}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def fringes_of(session: Session) -> str:
-    """The fringe sets in a line: axis, periods and steps of each."""
-    return ", ".join(f"{fringe.axis} {fringe.periods:g} x {fringe.steps}" for fringe in session.fringes)
 
 
 def _date(session: Session, date: str | None, now: datetime) -> tuple[datetime, str]:

@@ -1,23 +1,16 @@
-"""What the history of a scanner's verifications says: its drift, and whether an inspection may rely on the scanner."""
+"""What the history of a scanner's verifications says of its drift."""
 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
-from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from weldscan.errors import InputError
 from weldscan.records.fields import moment
-from weldscan.records.history import FILE, History, Record, read_history
-from weldscan.records.session import Session
-from weldscan.result import Drift, Standing, Verdict, Verification
-from weldscan.verification import CLOCK_SKEW, fringes_of, scanner_id
+from weldscan.records.history import History, Record
+from weldscan.result import Drift, Verification
 
 YEAR_S = 365.25 * 86_400
 # Two verifications make a line, three say how well it is known.
@@ -96,79 +89,3 @@ def slope(
     expanded = t95 * sigma
     told = "a drift" if abs(rate) > expanded else "no drift can be told"
     return rate, expanded, f"{rate:+.4f} ± {expanded:.4f} mm per year (95 %, {n} verifications): {told}"
-
-
-def standing_of(
-    session: Session,
-    history: str | os.PathLike[str] | None = None,
-    accept: str | None = None,
-    now: datetime | None = None,
-) -> Standing:
-    """What is on record about a session's scanner: whether an inspection may rely on it.
-
-    Looked for are `history`, the session's `verification`, then `verification.jsonl` in the session's folder and beside
-    it. Where there is none, nothing is asked for. The last verification of this very calibration decides: it must have
-    passed, still be valid and not lie in the future.
-
-    Args:
-        session: as `read_session` gave it.
-        history: the file to go by.
-        accept: the reason for which the scanner is relied on whatever the history says.
-        now: by default this moment.
-
-    Raises:
-        InputError: the file that was named is not there or is something else, or `accept` is empty.
-    """
-    if accept is not None and not accept.strip():
-        raise InputError("--accept-verification: give the reason; the report states it")
-    now = datetime.now(UTC) if now is None else now
-    path = _where(session, history)
-    if path is None:
-        return Standing("none", "no verification on record", accepted=accept)
-    found = read_history(path)
-    records = found.of(scanner_id(session.scanner))
-    last = records[-1] if records else None
-    why = found.broken
-    state: Literal["verified", "failed", "expired"] = "failed"
-    if why is not None:
-        why = f"the history cannot be relied upon: {why}"
-    elif last is None:
-        others = len({record.scanner for record in found.records})
-        held = f"; it holds {others} other scanner(s) or calibrations" if others else ""
-        why = f"the history holds no verification of this scanner ({scanner_id(session.scanner)}){held}"
-    elif last.when > now + CLOCK_SKEW:
-        why = f"the verification of {last.date} lies in the future: a clock is wrong"
-    elif last.verdict is not Verdict.PASS:
-        why = f"the last verification, of {last.date}, ended in {last.verdict}"
-    elif moment(last.valid_until, "valid_until") < now:
-        state, why = "expired", f"the verification of {last.date} expired on {last.valid_until}"
-    else:
-        state = "verified"
-    notes = list(found.notes)
-    if last is not None and last.fringes != fringes_of(session):
-        notes.append(
-            f"the scanner was verified with fringes {last.fringes or 'unknown'}, this session has {fringes_of(session)}"
-        )
-    text = why or ""
-    if last is not None and why is None:
-        judged = ", ".join(name for name, each in last.characteristics.items() if each.verdict is Verdict.PASS)
-        text = f"verified on {last.date} ({judged}), valid until {last.valid_until}"
-    return Standing(
-        state=state,
-        text=text,
-        history=str(path),
-        id=last.id if last else None,
-        date=last.date if last else None,
-        valid_until=last.valid_until if last else None,
-        accepted=accept,
-        notes=tuple(notes),
-    )
-
-
-def _where(session: Session, history: str | os.PathLike[str] | None) -> Path | None:
-    if history is not None:
-        return Path(history)
-    folder = session.folder
-    if session.verification is not None:
-        return folder / session.verification
-    return next((path for path in (folder / FILE, folder.resolve().parent / FILE) if path.is_file()), None)

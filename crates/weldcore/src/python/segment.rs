@@ -1,4 +1,4 @@
-//! Segmentation and step for Python: the two calls of `weldscan.inspection`.
+//! Segmentation and step for Python: the two calls of `weldscan.measure.inspection`.
 
 use numpy::{
     IntoPyArray, Ix3, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArrayDyn,

@@ -48,7 +48,7 @@ def hand_eye(
     (weldscan calibrate plan proposes them); centres that nobody touched need 5. Shots that contradict the others
     are named and not used.
     """
-    from weldscan.calibration.hand_eye import calibrate as solve
+    from weldscan.measure.session_hand_eye import calibrate as solve
     from weldscan.records.hand_eye import write_hand_eye
     from weldscan.report.hand_eye import write_hand_eye_page
     from weldscan.report.page import check_page
@@ -109,6 +109,7 @@ def plan(
 
     from weldscan.calibration import plan as planning
     from weldscan.errors import InputError
+    from weldscan.measure.session_hand_eye import mounted
     from weldscan.records.hand_eye import read_hand_eye
     from weldscan.records.plan import check_plan, read_source, write_plan
     from weldscan.report.page import check_page
@@ -127,7 +128,7 @@ def plan(
         elif hand_eye is not None:
             where = np.array(read_hand_eye(hand_eye).flange_from_scanner)
         else:
-            where = planning.mounted(given, source)
+            where = mounted(given, source)
         progress(1, 2, "choosing poses")
         found = planning.plan_poses(
             given.scanner.build(),

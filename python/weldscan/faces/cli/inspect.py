@@ -147,7 +147,7 @@ def _inspect_into(
     accept: str | None = None,
     required_coverage_deg: float | None = None,
 ) -> Inspection:
-    from weldscan.inspection import inspect as measure
+    from weldscan.measure.inspection import inspect as measure
     from weldscan.report import write_report
 
     with shown_progress() as progress:

@@ -30,7 +30,7 @@ def validate(
     from weldscan.records.touch import read_touch
     from weldscan.records.validation import is_validation
     from weldscan.report.validation import write_validation
-    from weldscan.validation import validate as hold_against
+    from weldscan.verification.validation import validate as hold_against
 
     out = out if out is not None else Path(f"{session.resolve().name}-touch")
     whole_folder.check(out, is_validation)

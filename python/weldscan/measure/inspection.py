@@ -18,21 +18,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldscan._weldcore import __version__, measure_step, place_shots, segment_weld
-from weldscan.agreement import PlacedShot, agreement, complaint, copies, shots_agree
-from weldscan.calibration.hand_eye import (
-    base_from_flange,
-    hand_eye_of,
-    point_uncertainty_mm,
-    pose_sigma,
-)
-from weldscan.calibration_margin import CalibrationMargin, Unevenness, calibration_above, calibration_margin
-from weldscan.description import held_against_itself, held_against_record, held_against_scan, not_used, other_part
+from weldscan.calibration.hand_eye import point_uncertainty_mm, pose_sigma
 from weldscan.errors import GeometryError, InputError
+from weldscan.measure.calibration_margin import CalibrationMargin, Unevenness, calibration_above, calibration_margin
+from weldscan.measure.observable_terms import seam_terms
+from weldscan.measure.paper_method import paper_step
+from weldscan.measure.part_views import PartView
+from weldscan.measure.scanner_standing import standing_of
+from weldscan.measure.seam_coverage import BIN_DEG, EdgeProfile, Seam, edge_profile, seam_of
+from weldscan.measure.session_hand_eye import base_from_flange, hand_eye_of
+from weldscan.measure.session_points import Compensate, PointReader, Progress
+from weldscan.measure.shot_agreement import PlacedShot, agreement, complaint, copies, shots_agree
+from weldscan.measure.stated_and_found import (
+    held_against_itself,
+    held_against_record,
+    held_against_scan,
+    not_used,
+    other_part,
+)
 from weldscan.norms import judge, load_norm
-from weldscan.observable import seam_terms
-from weldscan.paper_method import paper_step
-from weldscan.part_views import PartView
-from weldscan.points import Compensate, PointReader, Progress
 from weldscan.records.part import PartSpec
 from weldscan.records.response import Response, read_response
 from weldscan.records.session import Session, ShotSpec, read_session
@@ -53,8 +57,6 @@ from weldscan.result import (
     note,
     warning,
 )
-from weldscan.seam import BIN_DEG, EdgeProfile, Seam, edge_profile, seam_of
-from weldscan.verification.history import standing_of
 
 Floats = NDArray[np.float64]
 DEFAULT_NORMS = ("pnae-g-7-010-89",)

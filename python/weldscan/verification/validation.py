@@ -14,7 +14,7 @@ from weldscan._weldcore import KdTree
 from weldscan.calibration.artefact import TOUCH_SIGMA_MM
 from weldscan.calibration.hand_eye import point_uncertainty_mm, pose_sigma
 from weldscan.errors import InputError, NotMeasured
-from weldscan.inspection import inspect
+from weldscan.measure.inspection import inspect
 from weldscan.records.session import read_session
 from weldscan.records.touch import read_touch
 from weldscan.result import BudgetLine, PartCloud, Validation

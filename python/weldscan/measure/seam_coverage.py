@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldscan._weldcore import Scanner, seam_fates
-from weldscan.part_views import PartView
+from weldscan.measure.part_views import PartView
 from weldscan.result import FATES, Coverage, Finding, SeamBin, bar
 
 Floats = NDArray[np.float64]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from weldscan._weldcore import WeldShot, fit_cylinder
 from weldscan.errors import WeldscanError
-from weldscan.part_views import PartView
+from weldscan.measure.part_views import PartView
 from weldscan.records.fields import read_model
 from weldscan.records.part import PartSpec
 from weldscan.records.plan import planned

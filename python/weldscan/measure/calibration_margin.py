@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from weldscan._weldcore import Lens, Scanner
 from weldscan.calibration.bundle import K3, PARAMETERS, Features, Model, prior_sigmas, rotation, rows_of
 from weldscan.calibration.volume import point_jacobian
-from weldscan.part_views import PartView
+from weldscan.measure.part_views import PartView
 from weldscan.records.scanner import ScannerSpec
 from weldscan.result import Finding, Label, bar
 
@@ -96,7 +96,7 @@ def calibration_above(margin: CalibrationMargin | None, limit_mm: float, upper_m
         limit_mm: of the norm.
         upper_mm: |step| + U.
 
-    >>> from weldscan.calibration_margin import CalibrationMargin, calibration_above
+    >>> from weldscan.measure.calibration_margin import CalibrationMargin, calibration_above
     >>> margin = CalibrationMargin(u_mm=0.06, at_deg=210.0, stated=False)
     >>> calibration_above(margin, 1.1, 0.43) is None
     True

@@ -43,7 +43,7 @@ def seam_terms(step: Mapping[str, Any], outside_diameter_mm: float, wall_mm: flo
         wall_mm: rated thickness of the wall.
 
     Example:
-        >>> from weldscan.observable import seam_terms
+        >>> from weldscan.measure.observable_terms import seam_terms
         >>> step = {"radius_difference_mm": (-29.4, 34.2), "axis_offset_mm": (29.0, 6.0), "tilt_rad": 0.001}
         >>> seam_terms(step, 630.0, 6.0).not_observable
         ('diameter_difference', 'axis_offset', 'angle_between_walls')

@@ -1,0 +1,146 @@
+"""The hand-eye of a session: the one that it carries, or the one that its shots of the three-sphere plate give."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldscan.calibration.artefact import TOUCH_SIGMA_MM, PlateMismatch, PlateView, find_plate
+from weldscan.calibration.hand_eye import POSE_SIGMA_MM, POSE_SIGMA_RAD, TOUCH_BIAS_SIGMA_MM, solve_hand_eye
+from weldscan.errors import GeometryError, InputError, NotMeasured
+from weldscan.measure.session_points import PointReader, Progress
+from weldscan.pose import matrix_from_kuka
+from weldscan.records.hand_eye import HandEyeSpec, named_hand_eye
+from weldscan.records.plan import PlanSource
+from weldscan.records.session import Session, ShotSpec, read_session
+from weldscan.result import HandEye, warning
+
+Floats = NDArray[np.float64]
+
+
+def base_from_flange(shot: ShotSpec) -> Floats:
+    """The shot's flange pose as a matrix."""
+    pose = shot.flange_pose
+    if pose is None:
+        raise InputError(f"shot {shot.name!r}: it has no flange_pose")
+    return matrix_from_kuka(pose.X, pose.Y, pose.Z, pose.A, pose.B, pose.C)
+
+
+def hand_eye_of(read: PointReader, left_out: list[tuple[str, str]]) -> HandEye | None:
+    """The session's hand-eye: the one that it carries, else the one that its artefact shots give.
+
+    Args:
+        read: gives the shots' points.
+        left_out: gets the artefact shots that could not be used, with the reason.
+
+    Returns:
+        HandEye; None without a robot, or where no artefact shot could be used.
+
+    Raises:
+        PlateMismatch: the plate in view is not the one described, in no shot, or contradicts the poses.
+    """
+    session: Session = read.session
+    if isinstance(session.hand_eye, HandEyeSpec):
+        if not np.any(session.hand_eye.covariance):
+            read.findings.append(
+                warning("hand-eye", "hand_eye.covariance: is zero, so U holds nothing of the hand-eye")
+            )
+        return session.hand_eye.build()
+    if session.artefact is None or not session.artefact_shots:
+        return None
+    artefact, robot = session.artefact, session.robot
+    touched = None if artefact.centres_base is None else np.array(artefact.centres_base)
+    views: list[PlateView] = []
+    poses: list[Floats] = []
+    mistaken: PlateMismatch | None = None
+    unusable = {name for name, _ in left_out}
+    for shot in session.artefact_shots:
+        if shot.name in unusable:
+            continue
+        pose, cloud = base_from_flange(shot), read(shot)
+        t = time.perf_counter()
+        # Spheres that were not touched are told apart as the first shot has them.
+        reference = touched if touched is not None else views[0].centres_mm if views else None
+        eye = pose if touched is not None else np.eye(4)
+        try:
+            view = find_plate(shot.name, cloud.points_mm, artefact.sphere_diameter, reference, eye)
+        except PlateMismatch as error:
+            mistaken = error
+            left_out.append((shot.name, str(error)))
+        except GeometryError as error:
+            left_out.append((shot.name, read.why_dark(shot) or str(error)))
+        else:
+            twin = next((v.shot for v in views if np.array_equal(v.centres_mm, view.centres_mm)), None)
+            if twin is None:
+                views.append(view)
+                poses.append(pose)
+            else:
+                left_out.append((shot.name, f"is {twin} once more: a shot counts once"))
+        read.clock("spheres", t)
+    where = session.folder / "session.json"
+    if not views:
+        if mistaken is not None:
+            raise PlateMismatch(f"{where}: {mistaken}")
+        return None
+    t = time.perf_counter()
+    try:
+        solved = solve_hand_eye(
+            views,
+            poses,
+            touched,
+            pose_sigma_mm=(robot and robot.pose_sigma_mm) or POSE_SIGMA_MM,
+            pose_sigma_rad=math.radians((robot and robot.pose_sigma_deg) or 0.0) or POSE_SIGMA_RAD,
+            touch_sigma_mm=artefact.touch_sigma_mm or TOUCH_SIGMA_MM,
+            touch_bias_sigma_mm=artefact.touch_bias_sigma_mm or TOUCH_BIAS_SIGMA_MM,
+        )
+    except PlateMismatch as error:
+        raise PlateMismatch(f"{where}: {error}") from None
+    except (InputError, GeometryError) as error:
+        raise InputError(f"{where}: shots: {error}") from None
+    left_out.extend((shot.shot, shot.outlier) for shot in solved.per_shot if shot.outlier is not None)
+    read.findings.extend(warning("hand-eye", f"hand-eye: {text}") for text in solved.warnings)
+    read.clock("hand_eye", t)
+    return solved
+
+
+def calibrate(
+    session_folder: Path | str, progress: Progress | None = None, left_out: list[tuple[str, str]] | None = None
+) -> HandEye:
+    """flange_from_scanner from the artefact shots of a session (`weldscan calibrate hand-eye`).
+
+    Args:
+        session_folder: a `weldscan-session/1` folder with artefact shots; others in it are not looked at.
+        progress: called with (done, total, what).
+        left_out: gets the shots that were not used, with the reason.
+
+    Raises:
+        InputError: the session is wrong, or the plate in view is not the one that it describes.
+        NotMeasured: no artefact shot could be used; the message says why, shot by shot.
+    """
+    session = read_session(session_folder)
+    if not session.artefact_shots:
+        raise InputError(f"{session.folder / 'session.json'}: shots: none is of the artefact")
+    left_out = [] if left_out is None else left_out
+    found = hand_eye_of(PointReader(session, progress), left_out)
+    if found is None:
+        raise NotMeasured("; ".join(f"{name}: {why}" for name, why in left_out))
+    return found
+
+
+def mounted(source: PlanSource, path: str | os.PathLike[str]) -> Floats:
+    """flange_from_scanner as the source has it: its hand-eye, or the one that its artefact shots give."""
+    path = Path(path)
+    if source.hand_eye is not None:
+        file = path / "session.json" if path.is_dir() else path
+        return np.array(named_hand_eye(file, source.hand_eye).flange_from_scanner)
+    if path.is_dir() and any(shot.of == "artefact" for shot in source.shots):
+        return calibrate(path).flange_from_scanner
+    raise InputError(
+        f"{path}: hand_eye: missing; say roughly where the scanner sits on the flange with --mount 'X Y Z A B C' "
+        "(mm and degrees, the drawing's are good enough) or --hand-eye FILE"
+    )

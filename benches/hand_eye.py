@@ -22,7 +22,7 @@ from weldscan import register_rigid, solve_hand_eye
 from weldscan.calibration.artefact import PlateView
 from weldscan.calibration.hand_eye import point_covariance
 from weldscan.calibration.hand_eye_model import FACTORS, Linear, Noise, skew
-from weldscan.devices.simulated import DEFAULT, placed, tilted_views
+from weldscan.simulated import DEFAULT, placed, tilted_views
 
 TRUE = np.asarray(DEFAULT.flange_from_scanner)
 CENTRES = DEFAULT.sphere_centres()

@@ -15,9 +15,9 @@ import time
 
 from weldscan import KukaPose
 from weldscan.devices import backend
-from weldscan.devices.controller import Arm
-from weldscan.devices.robot import Robot, distance
-from weldscan.fringes import fringe_patterns
+from weldscan.devices.projectors.patterns import fringe_patterns
+from weldscan.devices.robots import Robot, distance
+from weldscan.simulated.controllers import Arm
 
 FLANGE = KukaPose(610.825, -148.476, 481.652, -29.008, 23.236, 74.641)
 TOOL = KukaPose(12.5, -3.25, 180.0, 15.0, -40.0, 5.0)

@@ -1,4 +1,4 @@
-"""Does a PASS hold? Scenes of every kind that `devices/scenes.py` draws, inspected; the verdicts by kind as a table.
+"""Does a PASS hold? Scenes of every kind of `weldscan.simulated.scenes`, inspected; the verdicts by kind as a table.
 
     python benches/trust.py --runs 30 --markdown docs/trust.md      # all kinds, 30 seeds each
     python benches/trust.py --kinds plain,taper --runs 10 --first 1000 --list
@@ -24,10 +24,10 @@ import numpy as np
 
 def _one(job: tuple[str, int, bool]) -> dict:
     import weldscan
-    from weldscan.devices import scenes
     from weldscan.errors import WeldscanError
     from weldscan.measure.inspection import inspect
     from weldscan.measure.session_points import MASKS, PointReader, Scan
+    from weldscan.simulated import scenes
 
     weldscan.set_threads(1)
     kind, seed, images = job
@@ -83,7 +83,7 @@ def _guarded(job: tuple[str, int, bool]) -> dict:
 
 def main() -> int:
     """Run the campaign; exit code 1 where anything passed that must not, or ended in an error."""
-    from weldscan.devices import scenes
+    from weldscan.simulated import scenes
 
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--runs", type=int, default=10, help="seeds per kind")
@@ -130,7 +130,7 @@ def _line(row: dict) -> str:
 
 
 def _table(rows: list[dict], kinds: list[str]) -> str:
-    from weldscan.devices import scenes
+    from weldscan.simulated import scenes
 
     out = ["| kind | group | runs | true above limit | wrong PASS | FAIL | INCONCLUSIVE | NOT MEASURED | honest kept |"]
     out.append("|---|---|---|---|---|---|---|---|---|")

@@ -15,7 +15,7 @@ import numpy as np
 
 import weldscan as ws
 from weldscan import _weldcore
-from weldscan.devices.simulated import DEFAULT, Body, Photometry, Sphere, make_scanner, pipe, render
+from weldscan.simulated import DEFAULT, Body, Photometry, Sphere, make_scanner, pipe, render
 
 Job = Callable[[], Any]
 JOBS: dict[str, Callable[[float], Job]] = {}

@@ -34,7 +34,7 @@ import numpy as np
 import catalogue
 import weldscan as ws
 from catalogue import sphere_mesh
-from weldscan.devices.simulated import Bead, Block, Body, Photometry, Sphere, Stem, Wall, Weld, pipe
+from weldscan.simulated import Bead, Block, Body, Photometry, Sphere, Stem, Wall, Weld, pipe
 
 HANG_S = 60.0
 """No input here is large: on a loaded machine, too, a second is plenty."""

@@ -13,12 +13,12 @@ import pytest
 
 from conftest import shared
 from test_description import CELL, Change, copied, of, pose_of
-from weldscan.devices.simulated import Wall, Weld, pipe, placed, simulate_session
 from weldscan.measure.inspection import inspect
 from weldscan.measure.session_hand_eye import calibrate
 from weldscan.measure.shot_agreement import _unlike, copies
 from weldscan.records.hand_eye import write_hand_eye
 from weldscan.result import Severity
+from weldscan.simulated import Wall, Weld, pipe, placed, simulate_session
 
 AROUND = (100.0, 145.0, 190.0)
 # Both walls 1 % of the diameter out of round, one after the other, not quite alike, and out of line.

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from test_simulate import small_scanner
-from weldscan.devices.simulated import DEFAULT, simulate_session
 from weldscan.faces.cli.app import main
+from weldscan.simulated import DEFAULT, simulate_session
 
 CELL = replace(DEFAULT, scanner=small_scanner(2), artefact_shots=2)
 WIDTH, HEIGHT = CELL.scanner.camera.width, CELL.scanner.camera.height
@@ -220,7 +220,7 @@ def test_probed_points_lie_on_the_scanned_surface(session, run):
 
 
 def test_the_demo_can_be_repeated(run, tmp_path, monkeypatch):
-    monkeypatch.setattr("weldscan.devices.simulated.DEFAULT", CELL)
+    monkeypatch.setattr("weldscan.simulated.DEFAULT", CELL)
     monkeypatch.setattr(simulate_session, "__defaults__", (CELL, None))
     for _ in range(2):
         code, out, complaints = run("demo", "--out", "demo")

@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from weldscan import DeviceError, GeometryError, InputError, NotMeasured
-from weldscan.devices.simulated import DEFAULT, simulate_session
 from weldscan.faces.cli import boundary
+from weldscan.simulated import DEFAULT, simulate_session
 
 START = """
 import os, signal, sys
@@ -285,8 +285,8 @@ BEGUN = {"scan": {".scan.lock", "scan.log"}}
 
 
 def written(session: Path, folder: Path, name: str, target: str, largest: int | None) -> tuple[int, str]:
-    from weldscan.devices.controller import HOME, Arm
-    from weldscan.devices.kvp import KvpController
+    from weldscan.simulated.controllers import HOME, Arm
+    from weldscan.simulated.controllers.kvp import KvpController
 
     with KvpController(Arm(HOME)) as controller:
         (folder / "cell.toml").write_text(CELL.format(port=controller.port))

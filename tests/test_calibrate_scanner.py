@@ -18,8 +18,8 @@ from weldscan.calibration import bundle
 from weldscan.calibration.board import find_board, parse_board
 from weldscan.calibration.captures import phases_at
 from weldscan.calibration.volume import point_jacobian
-from weldscan.devices.simulated import make_scanner, tilted_views
 from weldscan.errors import GeometryError, InputError, WeldscanError
+from weldscan.simulated import make_scanner, tilted_views
 
 BOARD = "chessboard:7x10:12mm"
 NOISE_PX = 0.1
@@ -508,8 +508,8 @@ def test_a_live_capture_without_an_operator_keeps_nothing(tmp_path, monkeypatch)
 
 def test_an_inspection_states_the_scanners_calibration(tmp_path):
     from weldscan import inspect, read_session
-    from weldscan.devices.simulated import DEFAULT, simulate_session
     from weldscan.report import result_document
+    from weldscan.simulated import DEFAULT, simulate_session
 
     folder = tmp_path / "session"
     simulate_session(folder, replace(DEFAULT, robot=None, artefact_shots=0, part_at_deg=(166.0,)))

@@ -11,7 +11,6 @@ import pytest
 from weldscan import Lens, Scanner
 from weldscan._weldcore import triangulate
 from weldscan.calibration.bundle import K3, PARAMETERS, rotation
-from weldscan.devices.scenes import scanner_for
 from weldscan.measure.calibration_margin import (
     NOISE_PX,
     CalibrationMargin,
@@ -25,6 +24,7 @@ from weldscan.measure.calibration_margin import (
 from weldscan.measure.part_views import PartView
 from weldscan.records.scanner import CovarianceSpec
 from weldscan.result import Label, Severity
+from weldscan.simulated.scenes import scanner_for
 
 SCANNER = scanner_for(211.0)
 DISTANCE_MM, RADIUS_MM, WALL_MM = 430.0, 315.0, 6.0

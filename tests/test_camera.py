@@ -13,7 +13,7 @@ import pytest
 
 from weldscan import DeviceError, DeviceTimeout
 from weldscan.devices import BACKENDS, backend
-from weldscan.devices.camera import Camera, CameraSettings, TornFrame
+from weldscan.devices.cameras import Camera, CameraSettings, TornFrame
 
 WIDTH, HEIGHT = 640, 480
 LATE_S = 1.0

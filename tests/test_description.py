@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 
 from test_simulate import small_scanner
-from weldscan.devices.simulated import DEFAULT, pipe, session_document, simulate_session
 from weldscan.measure.inspection import inspect
 from weldscan.measure.stated_and_found import held_against_itself
 from weldscan.records.session import Session
 from weldscan.records.shot import faults
 from weldscan.result import Finding, Inspection, Severity, Verdict
+from weldscan.simulated import DEFAULT, pipe, session_document, simulate_session
 
 CELL = replace(DEFAULT, scanner=small_scanner(2), artefact_shots=2)
 SMALL_PIPE = replace(CELL, weld=pipe(273.0, offset_mm=0.4), thickness_mm=10.0, part_at_deg=(100.0, 160.0))

@@ -9,7 +9,7 @@ import pytest
 from conftest import shared
 from weldscan import InputError, decode
 from weldscan._weldcore import saturation_level
-from weldscan.fringes import fringe_patterns
+from weldscan.devices.projectors.patterns import fringe_patterns
 from weldscan.records.session import FringeSet
 from weldscan.station.capture import full_scale, judge
 

@@ -24,12 +24,12 @@ from weldscan.calibration.hand_eye import (
     pose_sigma,
     solve_hand_eye,
 )
-from weldscan.devices.simulated import DEFAULT, placed, simulate_session, tilted_views
 from weldscan.errors import GeometryError, InputError
 from weldscan.measure.session_hand_eye import calibrate
 from weldscan.records.hand_eye import write_hand_eye
 from weldscan.report.hand_eye import write_hand_eye_page
 from weldscan.result import HandEye
+from weldscan.simulated import DEFAULT, placed, simulate_session, tilted_views
 
 TRUE = np.asarray(DEFAULT.flange_from_scanner)
 TOUCHED = DEFAULT.sphere_centres()

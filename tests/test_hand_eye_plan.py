@@ -19,12 +19,12 @@ from weldscan.calibration.hand_eye import (
     solve_hand_eye,
 )
 from weldscan.calibration.plan import SPHERE_SIGMA_MM, Limits, Plan, plan_poses
-from weldscan.devices.simulated import DEFAULT, placed, session_document, tilted_views
 from weldscan.errors import InputError
 from weldscan.faces.cli.app import app
 from weldscan.pose import KukaPose
 from weldscan.records.plan import read_plan
 from weldscan.result import HandEye
+from weldscan.simulated import DEFAULT, placed, session_document, tilted_views
 
 X = np.asarray(DEFAULT.flange_from_scanner)
 CENTRES = DEFAULT.sphere_centres()

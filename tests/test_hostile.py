@@ -11,7 +11,7 @@ import pytest
 
 import weldscan as ws
 from catalogue import ball, bits, sphere_mesh, tube
-from weldscan.devices.simulated import Block, Body, Photometry
+from weldscan.simulated import Block, Body, Photometry
 
 TREE = ws.KdTree(ball(50))
 MESH = ws.Mesh(*sphere_mesh(6))

@@ -16,13 +16,13 @@ import pytest
 from conftest import shared
 from test_simulate import small_scanner
 from weldscan import InputError, set_threads
-from weldscan.devices.simulated import DEFAULT, NO_BEAD, Bead, pipe, simulate_session
 from weldscan.measure import inspection
 from weldscan.measure.calibration_margin import CalibrationMargin
 from weldscan.measure.inspection import inspect
 from weldscan.measure.session_hand_eye import calibrate
 from weldscan.records.hand_eye import write_hand_eye
 from weldscan.result import Inspection, Verdict
+from weldscan.simulated import DEFAULT, NO_BEAD, Bead, pipe, simulate_session
 from weldscan.verification.validation import validate
 
 # --- the figures of issue 2, on sessions of an independent renderer

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from weldscan import KukaPose
-from weldscan.devices.controller import HOME, HOME_JOINTS, Arm, OutOfReach
-from weldscan.devices.kinematics import ArmGeometry
-from weldscan.devices.robot import distance
+from weldscan.devices.robots import distance
+from weldscan.simulated.controllers import HOME, HOME_JOINTS, Arm, OutOfReach
+from weldscan.simulated.controllers.kinematics import ArmGeometry
 
 ARM = ArmGeometry()
 MM = 1e-4

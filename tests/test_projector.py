@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from weldscan import DeviceError, DeviceTimeout, InputError
-from weldscan.devices import backend, window
-from weldscan.devices.projector import DisplayGone, correction, whole_refreshes
-from weldscan.fringes import flat_pattern, fringe_patterns
+from weldscan.devices import backend
+from weldscan.devices.projectors import DisplayGone, correction, whole_refreshes, window
+from weldscan.devices.projectors.patterns import flat_pattern, fringe_patterns
 from weldscan.records.response import measured, read_response
 
 SETS = [("x", 1, 4), ("x", 8, 4), ("y", 5, 3)]

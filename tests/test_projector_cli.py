@@ -9,8 +9,8 @@ import typer
 from typer.testing import CliRunner
 
 from weldscan import InputError, response_of_folder
+from weldscan.devices.projectors.patterns import fringe_patterns
 from weldscan.faces.cli.station import register
-from weldscan.fringes import fringe_patterns
 from weldscan.records.response import measured, read_response
 
 

@@ -29,8 +29,8 @@ from weldscan import (
     set_threads,
     write_response,
 )
-from weldscan.devices.simulated import DEFAULT, Photometry, simulate_session
 from weldscan.faces.cli.app import app
+from weldscan.simulated import DEFAULT, Photometry, simulate_session
 
 # What the issue asks of the real images, rad rms against the twelve steps.
 THREE_STEPS_RAD, FOUR_STEPS_RAD = 0.02, 0.008

@@ -10,8 +10,8 @@ import typer
 from typer.testing import CliRunner
 
 from weldscan import DeviceError, InputError
-from weldscan.devices.controller import Arm
 from weldscan.faces.cli.station import _controller, register
+from weldscan.simulated.controllers import Arm
 from weldscan.station.cell import read_cell
 
 MAIN = (  # a test that runs in the background has Ctrl-C switched off, and its children with it

@@ -10,15 +10,19 @@ import numpy as np
 import pytest
 
 from weldscan import DeviceError, DeviceTimeout, KukaPose
-from weldscan.devices.controller import Arm, Fault, TcpController
-from weldscan.devices.eki import EkiController, EkiRobot, EkiSettings
-from weldscan.devices.kinematics import ArmGeometry
-from weldscan.devices.kvp import READ, KvpController, KvpRobot, KvpSettings, encode_request
-from weldscan.devices.robot import distance, wait_until_still
-from weldscan.devices.rsi import RsiController, RsiRobot, RsiSettings
-from weldscan.devices.serial import SerialController, SerialRobot, SerialSettings, cut_line
-from weldscan.devices.wire import ConnectionLost, Link
+from weldscan.devices.robots import distance, wait_until_still
+from weldscan.devices.robots.eki import EkiRobot, EkiSettings
+from weldscan.devices.robots.kvp import READ, KvpRobot, KvpSettings, encode_request
+from weldscan.devices.robots.rsi import RsiRobot, RsiSettings
+from weldscan.devices.robots.serial import SerialRobot, SerialSettings, cut_line
+from weldscan.devices.robots.wire import ConnectionLost, Link
 from weldscan.pose import format_frame
+from weldscan.simulated.controllers import Arm, Fault, TcpController
+from weldscan.simulated.controllers.eki import EkiController
+from weldscan.simulated.controllers.kinematics import ArmGeometry
+from weldscan.simulated.controllers.kvp import KvpController
+from weldscan.simulated.controllers.rsi import RsiController
+from weldscan.simulated.controllers.serial import SerialController
 
 TIMEOUT_S = 0.6
 LATE_S = 0.7
@@ -528,7 +532,7 @@ def test_many_threads_one_robot(cell):
 
 
 def test_heartbeat(arm, monkeypatch):
-    monkeypatch.setattr("weldscan.devices.kvp.HEARTBEAT_S", 0.1)
+    monkeypatch.setattr("weldscan.devices.robots.kvp.HEARTBEAT_S", 0.1)
     controller, robot = connect("kvp", arm)
     with controller, robot:
         robot.pose()

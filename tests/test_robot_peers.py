@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from weldscan import KukaPose, parse_e6pos
-from weldscan.devices.controller import Arm
-from weldscan.devices.kvp import KvpController
-from weldscan.devices.rsi import RsiRobot, RsiSettings
+from weldscan.devices.robots.rsi import RsiRobot, RsiSettings
+from weldscan.simulated.controllers import Arm
+from weldscan.simulated.controllers.kvp import KvpController
 
 SERVER = (  # a test that runs in the background has Ctrl-C switched off, and its children with it
     "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "

@@ -12,13 +12,15 @@ from hypothesis import strategies as st
 
 from conftest import shared
 from weldscan import DeviceError, InputError, KukaPose
-from weldscan.devices import kvp
-from weldscan.devices.controller import Arm, Fault
-from weldscan.devices.eki import OURS, EkiConfig, EkiController, EkiUdpController, compose, dissect
-from weldscan.devices.rsi import RsiController, RsiRobot, RsiSettings
-from weldscan.devices.rsi_answer import answer
-from weldscan.devices.serial import checksum, cut_line, decode_line, encode_line
-from weldscan.devices.wire import cut_xml, parse_xml
+from weldscan.devices.robots import kvp
+from weldscan.devices.robots.eki import OURS, EkiConfig, compose, dissect
+from weldscan.devices.robots.rsi import RsiRobot, RsiSettings
+from weldscan.devices.robots.rsi_answer import answer
+from weldscan.devices.robots.serial import checksum, cut_line, decode_line, encode_line
+from weldscan.devices.robots.wire import cut_xml, parse_xml
+from weldscan.simulated.controllers import Arm, Fault
+from weldscan.simulated.controllers.eki import EkiController, EkiUdpController
+from weldscan.simulated.controllers.rsi import RsiController
 
 POSE = KukaPose(610.825, -148.476, 481.652, -29.008, 23.236, 74.641)
 KRL = Path(__file__).resolve().parents[1] / "krl"

@@ -19,15 +19,15 @@ import pytest
 
 from weldscan import DeviceError, DeviceTimeout, InputError, KukaPose
 from weldscan.devices import backend
-from weldscan.devices.camera import Camera, CameraSettings
-from weldscan.devices.controller import Arm, Fault
-from weldscan.devices.kvp import KvpController
-from weldscan.devices.projector import DisplayGone, Projector, ProjectorSettings
-from weldscan.devices.robot import distance
-from weldscan.fringes import flat_pattern, fringe_patterns
+from weldscan.devices.cameras import Camera, CameraSettings
+from weldscan.devices.projectors import DisplayGone, Projector, ProjectorSettings
+from weldscan.devices.projectors.patterns import flat_pattern, fringe_patterns
+from weldscan.devices.robots import distance
 from weldscan.records.frames import read_frames
 from weldscan.records.session import read_session
 from weldscan.records.shot import left_out
+from weldscan.simulated.controllers import Arm, Fault
+from weldscan.simulated.controllers.kvp import KvpController
 from weldscan.station import check, store
 from weldscan.station import scan as scan_module
 from weldscan.station.capture import judge
@@ -714,8 +714,8 @@ def test_the_live_cell(tmp_path):
     from dataclasses import replace
 
     from weldscan import Lens
-    from weldscan.devices.simulated import DEFAULT, make_scanner, render, session_document
     from weldscan.faces.live_demo import record_live
+    from weldscan.simulated import DEFAULT, make_scanner, render, session_document
 
     lens = Lens(160, 120, [[326.0, 0, 80.0], [0, 326.0, 60.0], [0, 0, 1]], [0.0, 0.0, 0.0, 0.0])
     projector = Lens(160, 100, [[260.0, 0, 80.0], [0, 260.0, 50.0], [0, 0, 1]], [0.0, 0.0, 0.0, 0.0])

@@ -11,8 +11,8 @@ import pytest
 
 from weldscan import InputError, decode, measure_step, read_frames, read_session, segment_weld, set_threads, triangulate
 from weldscan._weldcore import WeldSurface
-from weldscan.devices import scenes
-from weldscan.devices.scenes import (
+from weldscan.simulated import scenes
+from weldscan.simulated.scenes import (
     DARK,
     KINDS,
     OK,

@@ -16,7 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from weldscan import GeometryError, InputError, Lens, Scanner, SimulatedShot, set_threads, simulate_shot, simulated_step
-from weldscan.devices.simulated import (
+from weldscan.pose import matrix_from_kuka
+from weldscan.records.frames import read_frames
+from weldscan.records.session import read_session
+from weldscan.simulated import (
     BEAD,
     DEFAULT,
     NO_BEAD,
@@ -41,9 +44,6 @@ from weldscan.devices.simulated import (
     render,
     simulate_session,
 )
-from weldscan.pose import matrix_from_kuka
-from weldscan.records.frames import read_frames
-from weldscan.records.session import read_session
 
 # Surfaces are met within 1e-8 mm and lenses within 1e-12: what is left is rounding.
 POINT_MM = 1e-6

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from conftest import shared
-from weldscan.devices import scenes
 from weldscan.measure.inspection import inspect
 from weldscan.measure.session_points import MASKS, PointReader, Scan
 from weldscan.result import FATES, Verdict
+from weldscan.simulated import scenes
 
 MUST_NOT_PASS = {
     "hard-taper": {"transition"},

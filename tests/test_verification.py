@@ -20,11 +20,11 @@ from hypothesis import strategies as st
 from conftest import shared
 from test_simulate import small_scanner
 from weldscan import GeometryError, InputError, Verdict, inspect
-from weldscan.devices.simulated import DEFAULT, simulate_session
 from weldscan.measure.scanner_standing import scanner_id, standing_of
 from weldscan.records.history import append_history, check_history, read_history
 from weldscan.records.session import read_session
 from weldscan.result import Characteristic, Verification
+from weldscan.simulated import DEFAULT, simulate_session
 from weldscan.verification import (
     VerificationLimits,
     flatness_error,

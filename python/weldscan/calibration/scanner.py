@@ -191,7 +191,7 @@ def solve_scanner(
         >>> import numpy as np
         >>> from weldscan import BoardView, solve_scanner
         >>> from weldscan.calibration.board import parse_board
-        >>> from weldscan.devices.simulated import make_scanner, tilted_views
+        >>> from weldscan.simulated import make_scanner, tilted_views
         >>> truth, board = make_scanner(), parse_board("chessboard:8x11:8mm").points_mm()
         >>> views = []
         >>> for i, board_from_camera in enumerate(tilted_views(np.eye(4), 6)):

@@ -7,28 +7,28 @@ from typing import Any
 
 BACKENDS = {
     "robot": {
-        "kvp": "kvp:KvpRobot",
-        "eki": "eki:EkiRobot",
-        "rsi": "rsi:RsiRobot",
-        "serial": "serial:SerialRobot",
+        "kvp": "devices.robots.kvp:KvpRobot",
+        "eki": "devices.robots.eki:EkiRobot",
+        "rsi": "devices.robots.rsi:RsiRobot",
+        "serial": "devices.robots.serial:SerialRobot",
     },
     "controller": {
-        "kvp": "kvp:KvpController",
-        "eki": "eki:EkiController",
-        "rsi": "rsi:RsiController",
-        "serial": "serial:SerialController",
+        "kvp": "simulated.controllers.kvp:KvpController",
+        "eki": "simulated.controllers.eki:EkiController",
+        "rsi": "simulated.controllers.rsi:RsiController",
+        "serial": "simulated.controllers.serial:SerialController",
     },
     "camera": {
-        "opencv": "opencv:OpenCvCamera",
-        "aravis": "aravis:AravisCamera",
-        "pylon": "pylon:PylonCamera",
-        "folder": "folder:FolderCamera",
-        "simulated": "virtual:VirtualCamera",
+        "opencv": "devices.cameras.opencv:OpenCvCamera",
+        "aravis": "devices.cameras.aravis:AravisCamera",
+        "pylon": "devices.cameras.pylon:PylonCamera",
+        "folder": "devices.folder:FolderCamera",
+        "simulated": "simulated.camera_and_projector:VirtualCamera",
     },
     "projector": {
-        "window": "window:WindowProjector",
-        "files": "folder:FolderProjector",
-        "simulated": "virtual:VirtualProjector",
+        "window": "devices.projectors.window:WindowProjector",
+        "files": "devices.folder:FolderProjector",
+        "simulated": "simulated.camera_and_projector:VirtualProjector",
     },
 }
 
@@ -40,4 +40,4 @@ def backend(kind: str, name: str) -> Any:
     'KvpRobot'
     """
     module, attribute = BACKENDS[kind][name].split(":")
-    return getattr(import_module(f"{__name__}.{module}"), attribute)
+    return getattr(import_module(f"weldscan.{module}"), attribute)

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan.devices.camera import Camera, CameraSettings
-from weldscan.devices.projector import Projector, ProjectorSettings
+from weldscan.devices.cameras import Camera, CameraSettings
+from weldscan.devices.projectors import Projector, ProjectorSettings
 from weldscan.errors import DeviceError, DeviceTimeout, InputError
 from weldscan.records.files import read_bytes, write_file
 from weldscan.records.images import MAX_IMAGE_BYTES, encode_png

@@ -9,12 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from weldscan.devices.controller import Arm
-from weldscan.devices.kvp import KvpController
-from weldscan.devices.simulated import DEFAULT, Cell, session_document
 from weldscan.errors import InputError, NotMeasured
 from weldscan.pose import KukaPose
 from weldscan.records.files import write_file
+from weldscan.simulated import DEFAULT, Cell, session_document
+from weldscan.simulated.controllers import Arm
+from weldscan.simulated.controllers.kvp import KvpController
 from weldscan.station.cell import CellConfig
 from weldscan.station.scan import scan
 

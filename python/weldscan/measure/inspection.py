@@ -103,7 +103,7 @@ def inspect(
     Example:
         >>> import tempfile
         >>> from weldscan import inspect
-        >>> from weldscan.devices.simulated import simulate_session
+        >>> from weldscan.simulated import simulate_session
         >>> folder = tempfile.mkdtemp() + "/session"
         >>> truth = simulate_session(folder)
         >>> result = inspect(folder)

@@ -323,7 +323,7 @@ def read_result(path: str | os.PathLike[str]) -> dict[str, Any]:
     Example:
         >>> import tempfile
         >>> from weldscan import inspect, read_result, write_report
-        >>> from weldscan.devices.simulated import simulate_session
+        >>> from weldscan.simulated import simulate_session
         >>> folder = tempfile.mkdtemp()
         >>> truth = simulate_session(folder + "/session")
         >>> out = write_report(inspect(folder + "/session"), folder + "/report")

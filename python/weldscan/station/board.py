@@ -13,11 +13,11 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from weldscan.devices.camera import Camera, Image
-from weldscan.devices.projector import Projector
-from weldscan.devices.robot import Robot, wait_until_still
+from weldscan.devices.cameras import Camera, Image
+from weldscan.devices.projectors import Projector
+from weldscan.devices.projectors.patterns import board_fringes, fringe_patterns
+from weldscan.devices.robots import Robot, wait_until_still
 from weldscan.errors import DeviceError, InputError
-from weldscan.fringes import board_fringes, fringe_patterns
 from weldscan.pose import KukaPose
 from weldscan.records.files import to_json, whole_folder, write_synced
 from weldscan.records.images import encode_png

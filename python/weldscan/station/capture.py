@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldscan._weldcore import saturation_level
-from weldscan.devices.camera import Camera, Image
-from weldscan.devices.projector import Pattern, Projector, whole_refreshes
+from weldscan.devices.cameras import Camera, Image
+from weldscan.devices.projectors import Pattern, Projector, whole_refreshes
 
 log = logging.getLogger("weldscan.scan")
 Sets = Sequence[tuple[str, float, int]]

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from weldscan.devices import BACKENDS, backend
-from weldscan.devices.robot import Robot
+from weldscan.devices.robots import Robot
 from weldscan.errors import InputError
 from weldscan.records.fields import explain
 from weldscan.records.files import read_toml

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldscan.calibration.response import response_of_ramp
-from weldscan.devices.camera import Camera, Image
-from weldscan.devices.projector import Projector
+from weldscan.devices.cameras import Camera, Image
+from weldscan.devices.projectors import Projector
+from weldscan.devices.projectors.patterns import flat_pattern
 from weldscan.errors import DeviceError, DeviceTimeout
-from weldscan.fringes import flat_pattern
 from weldscan.records.files import write_file
 from weldscan.records.images import encode_png
 from weldscan.records.response import Response

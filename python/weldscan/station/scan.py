@@ -17,11 +17,11 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from weldscan.devices.camera import Camera, Image
-from weldscan.devices.projector import Projector
-from weldscan.devices.robot import Robot, StampedPose, distance, wait_until_still
+from weldscan.devices.cameras import Camera, Image
+from weldscan.devices.projectors import Projector
+from weldscan.devices.projectors.patterns import flat_pattern, fringe_patterns
+from weldscan.devices.robots import Robot, StampedPose, distance, wait_until_still
 from weldscan.errors import DeviceError, InputError, WeldscanError
-from weldscan.fringes import flat_pattern, fringe_patterns
 from weldscan.pose import KukaPose
 from weldscan.records.hand_eye import read_hand_eye
 from weldscan.records.plan import read_plan

@@ -17,7 +17,7 @@ from typing import Any, Self
 
 from pydantic import ValidationError
 
-from weldscan.devices.camera import Image
+from weldscan.devices.cameras import Image
 from weldscan.errors import InputError
 from weldscan.records.files import to_json, whole_folder, write_file, write_synced
 from weldscan.records.images import encode_png

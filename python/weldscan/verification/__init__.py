@@ -214,7 +214,7 @@ def verify(
     Example:
         >>> import tempfile
         >>> from weldscan import verify
-        >>> from weldscan.devices.simulated import simulate_session
+        >>> from weldscan.simulated import simulate_session
         >>> folder = tempfile.mkdtemp() + "/session"
         >>> truth = simulate_session(folder)
         >>> found = verify(folder, {"pf_mm": 0.5, "sd_mm": 0.2})

@@ -236,10 +236,10 @@ enum Fringe {
 /// Args:
 ///     scanner: `Scanner`.
 ///     scene_from_scanner: (4, 4), where the scanner (its camera) stands in the scene, mm.
-///     bodies: what stands in the scene: `weldscan.devices.simulated.Body`.
+///     bodies: what stands in the scene: `weldscan.simulated.cell.Body`.
 ///     fringes: sets of (axis "x" or "y", periods, steps), or these and (direction 1 or -1, origin_rad) as a session has
 ///         them; none for white images alone.
-///     photometry: lamp, room, projector and sensor: `weldscan.devices.simulated.Photometry`.
+///     photometry: lamp, room, projector and sensor: `weldscan.simulated.cell.Photometry`.
 ///     exposures: factors on the light, one stack of frames each.
 ///     seed: start of the random numbers.
 ///
@@ -252,7 +252,7 @@ enum Fringe {
 /// Example:
 ///     >>> import numpy as np
 ///     >>> from weldscan import simulate_shot
-///     >>> from weldscan.devices.simulated import DEFAULT, Body, Photometry, Sphere
+///     >>> from weldscan.simulated.cell import DEFAULT, Body, Photometry, Sphere
 ///     >>> ball = np.eye(4)
 ///     >>> ball[2, 3] = 420.0
 ///     >>> shot = simulate_shot(DEFAULT.scanner, np.eye(4), [Body(Sphere(10.0), ball)], [("x", 8, 4)], Photometry())
@@ -334,7 +334,7 @@ fn array<T: numpy::Element>(py: Python<'_>, flat: Vec<T>, height: usize, width: 
 /// The true step of a simulated weld at the seam: other wall minus reference wall along the radius, waviness left out.
 ///
 /// Args:
-///     weld: `weldscan.devices.simulated.Weld`.
+///     weld: `weldscan.simulated.cell.Weld`.
 ///     along: (n,) angles about the axis, rad; for plates places along the seam, mm.
 ///
 /// Returns:
@@ -346,7 +346,7 @@ fn array<T: numpy::Element>(py: Python<'_>, flat: Vec<T>, height: usize, width: 
 /// Example:
 ///     >>> import numpy as np
 ///     >>> from weldscan import simulated_step
-///     >>> from weldscan.devices.simulated import Bead, Wall, Weld
+///     >>> from weldscan.simulated.cell import Bead, Wall, Weld
 ///     >>> weld = Weld(Wall(315.0), Wall(315.0, offset_mm=(0.5, 0.0)), Bead())
 ///     >>> simulated_step(weld, np.array([0.0, np.pi])).round(6)
 ///     array([ 0.5, -0.5])
@@ -565,7 +565,7 @@ impl From<PyScene> for scene::Scene {
 /// The surface of a weld as a height field over a pipe, its random parts drawn.
 ///
 /// Args:
-///     weld: `weldscan.devices.scenes.Weld`.
+///     weld: `weldscan.simulated.drawn.Weld`.
 ///
 /// Raises:
 ///     InputError: a number is out of its range or not finite; the message names it.

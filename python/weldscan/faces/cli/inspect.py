@@ -113,8 +113,8 @@ def demo(
     ] = False,
 ) -> None:
     """Simulate a cell (scanner, robot, three-sphere plate, welded pipe), record a session and inspect it."""
-    from weldscan.devices.simulated import simulate_session
     from weldscan.records.files import whole_folder
+    from weldscan.simulated import simulate_session
 
     with whole_folder(out, _is_demo) as partial:
         with shown_progress() as progress:

@@ -23,10 +23,10 @@ from weldscan.faces.cli.boundary import NOT_MEASURED
 from weldscan.faces.cli.progress import shown_progress
 
 if TYPE_CHECKING:
-    from weldscan.devices.controller import Arm, Controller
-    from weldscan.devices.robot import Robot, StampedPose
+    from weldscan.devices.robots import Robot, StampedPose
     from weldscan.pose import KukaPose
     from weldscan.records.session import ShotSpec
+    from weldscan.simulated.controllers import Arm, Controller
 
 
 def _group(about: str) -> typer.Typer:
@@ -113,7 +113,7 @@ def robot_simulate(
         raise InputError(f"--link: {link!r} is none of {', '.join(BACKENDS['controller'])}")
     if f"#{mode.upper()}" not in MODES:
         raise InputError(f"--mode: {mode!r} is none of {', '.join(known.removeprefix('#') for known in MODES)}")
-    from weldscan.devices.controller import HOME, Arm
+    from weldscan.simulated.controllers import HOME, Arm
 
     arm = Arm(_pose(pose.split()) if pose else HOME, mode=f"#{mode.upper()}")
     arm.speed_mm_s = speed
@@ -173,7 +173,7 @@ def project(
     hold: Annotated[float, typer.Option(min=0.0, help="Seconds for each pattern; 0: until Ctrl-C.")] = 0.0,
 ) -> None:
     """Show a pattern on the projector. On which display: x and y of the cell's [projector]."""
-    from weldscan.fringes import flat_pattern, fringe_patterns
+    from weldscan.devices.projectors.patterns import flat_pattern, fringe_patterns
     from weldscan.station.cell import read_cell
     from weldscan.station.scan import read_settings
 
@@ -295,7 +295,7 @@ def _robot(config: Path) -> Robot:
 
 def _controller(link: str, arm: Arm, host: str, port: int | None) -> Any:
     """A controller on the wanted port; or on the link's usual one, or where that is taken on any."""
-    from weldscan.devices.wire import checked_host
+    from weldscan.devices.robots.wire import checked_host
 
     kind = backend("controller", link)
     if link == "serial":
@@ -322,7 +322,7 @@ def _obey_lines(controller: Controller) -> None:
 
 
 def _inject(controller: Controller, request: str) -> None:
-    from weldscan.devices.controller import Fault
+    from weldscan.simulated.controllers import Fault
 
     words = request.split()
     try:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan.devices.camera import Camera, CameraSettings, TornFrame
+from weldscan.devices.cameras import Camera, CameraSettings, TornFrame
 from weldscan.errors import DeviceError, DeviceTimeout
 
 BUFFERS = 4

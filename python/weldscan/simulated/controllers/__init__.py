@@ -19,11 +19,11 @@ from typing import Self
 
 import numpy as np
 
-from weldscan.devices.kinematics import ArmGeometry, Joints
-from weldscan.devices.robot import distance
-from weldscan.devices.wire import Cut, Messages, TcpTransport, Transport
+from weldscan.devices.robots import distance
+from weldscan.devices.robots.wire import Cut, Messages, TcpTransport, Transport
 from weldscan.errors import DeviceError, DeviceTimeout
 from weldscan.pose import Floats, KukaPose
+from weldscan.simulated.controllers.kinematics import ArmGeometry, Joints
 
 HOME_JOINTS: Joints = (0.0, -90.0, 90.0, 0.0, 30.0, 0.0)
 HOME = KukaPose.from_matrix(ArmGeometry().flange(HOME_JOINTS))

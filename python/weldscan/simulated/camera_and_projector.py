@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from weldscan.devices import BACKENDS, backend
-from weldscan.devices.camera import Camera, CameraSettings
-from weldscan.devices.projector import Projector, ProjectorSettings
-from weldscan.devices.simulated import DEFAULT, BoardCell, Cell, render
+from weldscan.devices.cameras import Camera, CameraSettings
+from weldscan.devices.projectors import Projector, ProjectorSettings
+from weldscan.devices.projectors.patterns import fringe_patterns
 from weldscan.errors import DeviceError, InputError
-from weldscan.fringes import fringe_patterns
 from weldscan.records.fields import explain
+from weldscan.simulated import DEFAULT, BoardCell, Cell, render
 
 _SHOWN: dict[str, NDArray[np.uint8]] = {}
 """The one projector of the one simulated cell of this process."""
@@ -68,7 +68,7 @@ class VirtualCameraSettings(CameraSettings):
     """A chessboard lies in the cell, `9x13:10mm`: inner corners and square. Without a controller somebody moves it on
     after every whole stack of fringes."""
     cell: Any = None
-    """A `weldscan.devices.simulated.Cell`, where a program makes the configuration; absent: the demo's."""
+    """A `weldscan.simulated.Cell`, where a program makes the configuration; absent: the demo's."""
 
 
 class VirtualCamera(Camera):

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from numpy.typing import NDArray
 from pydantic import Field
 
-from weldscan.devices.camera import Camera, CameraSettings, TornFrame
+from weldscan.devices.cameras import Camera, CameraSettings, TornFrame
 from weldscan.errors import DeviceError, DeviceTimeout
 
 

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan.devices.projector import DisplayGone, Projector, ProjectorSettings
+from weldscan.devices.projectors import DisplayGone, Projector, ProjectorSettings
 from weldscan.errors import DeviceError, DeviceTimeout
 
 START_S, SHOW_S = 20.0, 5.0

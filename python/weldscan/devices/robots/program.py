@@ -8,13 +8,11 @@ written.
 from __future__ import annotations
 
 import abc
-import threading
 import time
 from collections.abc import Sequence
 from enum import IntEnum
 
-from weldscan.devices.controller import Arm, Fault, OutOfReach
-from weldscan.devices.robot import Reading, StreamRobot
+from weldscan.devices.robots import Reading, StreamRobot
 from weldscan.errors import DeviceError
 from weldscan.pose import KukaPose
 
@@ -81,31 +79,3 @@ class ProgramRobot(StreamRobot):
 
 def _meaning(status: int) -> str:
     return Status(status).name.lower().replace("_", " ") if status in list(Status) else f"status {status}"
-
-
-# --- the program itself, as the simulated controllers run it ----------------------------------------------------------
-
-
-def carry_out(arm: Arm, target: KukaPose, stop: threading.Event) -> Status:
-    """Move, wait until the arm has arrived, and say how it went."""
-    if arm.mode != "#T1":
-        return Status.NOT_IN_T1
-    try:
-        arm.move(target)
-    except OutOfReach:
-        return Status.OUT_OF_REACH
-    while arm.moving and not stop.wait(POLL_S):
-        pass
-    return Status.DONE
-
-
-def codes(arm: Arm) -> tuple[int, int]:
-    """Return the codes of $MODE_OP and $IPO_MODE; 0 for what the programs do not know."""
-    mode = next((code for code, name in MODES.items() if name == arm.mode), 0)
-    return mode, next((code for code, name in INTERPOLATIONS.items() if name == arm.interpolation), 0)
-
-
-def numbers(arm: Arm, fault: Fault | None) -> list[float]:
-    """Return $POS_ACT, $TOOL, $BASE and the joints."""
-    position = arm.position(fault)
-    return [*position.values(), *arm.tool.values(), *arm.base.values(), *arm.joints_deg]

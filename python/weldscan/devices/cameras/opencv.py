@@ -15,7 +15,7 @@ import cv2
 from numpy.typing import NDArray
 from pydantic import Field
 
-from weldscan.devices.camera import Camera, CameraSettings
+from weldscan.devices.cameras import Camera, CameraSettings
 from weldscan.errors import DeviceError, DeviceTimeout
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what is wrong is told by us, in one line

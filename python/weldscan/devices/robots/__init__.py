@@ -17,7 +17,7 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from weldscan.devices.wire import Cut, Link, Transport
+from weldscan.devices.robots.wire import Cut, Link, Transport
 from weldscan.errors import DeviceError, DeviceTimeout
 from weldscan.pose import KukaPose
 

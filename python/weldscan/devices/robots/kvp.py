@@ -17,11 +17,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from weldscan.devices.controller import Arm, Fault, OutOfReach, TcpController
-from weldscan.devices.robot import POLL_S, Reading, RobotSettings, StreamRobot, distance
-from weldscan.devices.wire import Host, TcpTransport
+from weldscan.devices.robots import POLL_S, Reading, RobotSettings, StreamRobot, distance
+from weldscan.devices.robots.wire import Host, TcpTransport
 from weldscan.errors import DeviceError, DeviceTimeout, InputError
-from weldscan.pose import KukaPose, format_e6axis, format_e6pos, format_frame, parse_e6axis, parse_e6pos, parse_frame
+from weldscan.pose import KukaPose, format_frame, parse_e6axis, parse_e6pos, parse_frame
 
 READ, WRITE, READ_UNICODE, WRITE_UNICODE, READ_MANY, WRITE_MANY = 0, 1, 4, 5, 6, 7
 LAST_NUMBER = 65_535
@@ -67,7 +66,7 @@ def encode_request(number: int, function: int, texts: Sequence[str]) -> bytes:
     body = bytes([function])
     if many:
         body += bytes([len(texts) // (2 if function == WRITE_MANY else 1)])
-    return _head(number, body + b"".join(_text(text, function) for text in texts))
+    return framed(number, body + b"".join(_text(text, function) for text in texts))
 
 
 def decode_request(frame: bytes) -> tuple[int, int, list[str]]:
@@ -90,7 +89,7 @@ def encode_reply(number: int, function: int, values: Sequence[str | None], ok: b
         body += b"".join(bytes([value is not None]) + _text(value or "", function) for value in values)
     else:
         body += _text(values[0] or "", function)
-    return _head(number, body + (DONE if ok else REFUSED))
+    return framed(number, body + (DONE if ok else REFUSED))
 
 
 def decode_reply(frame: bytes, number: int, function: int, count: int = 1) -> list[str]:
@@ -121,7 +120,7 @@ def decode_reply(frame: bytes, number: int, function: int, count: int = 1) -> li
     return values
 
 
-def _head(number: int, body: bytes) -> bytes:
+def framed(number: int, body: bytes) -> bytes:
     return struct.pack(">HH", number, len(body)) + body
 
 
@@ -256,78 +255,3 @@ class KvpRobot(StreamRobot):
                     self.get("$MODE_OP")
                 except DeviceError:
                     continue  # the next question says so to someone who can act on it
-
-
-# --- the simulated controller -----------------------------------------------------------------------------------------
-
-
-class KvpController(TcpController):
-    """A simulated controller with KUKAVARPROXY or C3 Bridge, our motion program running on it."""
-
-    def __init__(self, arm: Arm | None = None, host: str = "127.0.0.1", port: int = 0, c3: bool = False) -> None:
-        self.c3 = c3
-        self.variables = {
-            "COM_ACTION": "0",
-            "COM_TARGET": "",
-            "$PRO_NAME1[]": f'"{PROGRAM}"',
-            "$PRO_STATE1": "#P_ACTIVE",
-        }
-        super().__init__(arm, host, port)
-
-    def cut(self, buffer: bytearray) -> bytes | None:
-        """Cut one request."""
-        return cut_frame(buffer)
-
-    def answer(self, request: bytes, fault: Fault | None) -> bytes:
-        """Read or write variables."""
-        number, function, texts = decode_request(request)
-        if fault is Fault.WRONG_ID:
-            number ^= 0x00FF
-        if function in (WRITE, WRITE_UNICODE, WRITE_MANY):
-            for name, value in zip(texts[::2], texts[1::2], strict=True):
-                self._set(name.upper(), value)
-            values: list[str | None] = list(texts[1::2])
-        elif function in (READ, READ_UNICODE, READ_MANY):
-            values = [self._get(name.upper(), fault) for name in texts]
-        else:
-            return encode_reply(number, function, [None], ok=False)
-        # An unknown variable: C3 Bridge says so, KUKAVARPROXY answers success with nothing in it.
-        ok = not (self.c3 and None in values)
-        if fault is Fault.EMPTY:
-            values = [None for _ in values]
-        reply = encode_reply(number, function, values, ok=ok)
-        if fault is Fault.WRONG_LENGTH:
-            reply = _head(number, reply[4:] + bytes(7))
-        return reply
-
-    def _get(self, name: str, fault: Fault | None) -> str | None:
-        arm = self.arm
-        if name == "COM_ACTION" and not arm.moving and self.variables["$PRO_STATE1"] == "#P_ACTIVE":
-            return "0"
-        match name:
-            case "$POS_ACT":
-                text = format_e6pos(arm.position(fault))
-                return "{E6POS: X NaN, " + text.split(", ", 1)[1] if fault is Fault.NAN else text
-            case "$AXIS_ACT":
-                return format_e6axis(arm.joints_deg)
-            case "$TOOL":
-                return format_frame(arm.tool)
-            case "$BASE":
-                return format_frame(arm.base)
-            case "$IPO_MODE":
-                return arm.interpolation
-            case "$MODE_OP":
-                return arm.mode
-            case "$ROBNAME[]":
-                return '"SIMULATED"'
-            case _:
-                return self.variables.get(name)
-
-    def _set(self, name: str, value: str) -> None:
-        self.variables[name] = value
-        # As the program does it: it looks at COM_ACTION when it has arrived, and in T1 alone.
-        if name == "COM_ACTION" and value == "1" and self.arm.mode == "#T1" and not self.arm.moving:
-            try:
-                self.arm.move(parse_frame(self.variables["COM_TARGET"]))
-            except (OutOfReach, InputError):  # the controller stops a program that it cannot go on with
-                self.variables["$PRO_STATE1"] = "#P_STOP"

@@ -9,6 +9,7 @@ import numpy as np
 from weldscan.norms import judge
 from weldscan.result import (
     ArtefactShot,
+    ArtefactSphere,
     BudgetLine,
     Coverage,
     Finding,
@@ -18,7 +19,6 @@ from weldscan.result import (
     Label,
     PartCloud,
     SeamBin,
-    SphereFit,
     StepResult,
     along_seam_mm,
     bar,
@@ -73,8 +73,8 @@ def hand_eye(shots: int = 6) -> HandEye:
     """A made-up calibration."""
     random = np.random.default_rng(2)
 
-    def sphere() -> SphereFit:
-        return SphereFit(
+    def sphere() -> ArtefactSphere:
+        return ArtefactSphere(
             centre_mm=random.normal([0, 0, 420], 30),
             covariance_mm2=np.eye(3) * 1e-5,
             rms_mm=float(random.uniform(0.02, 0.04)),

@@ -42,7 +42,7 @@ from weldscan.calibration.hand_eye_model import (
     skew,
 )
 from weldscan.errors import GeometryError, InputError
-from weldscan.result import ArtefactShot, HandEye, SphereFit
+from weldscan.result import ArtefactShot, ArtefactSphere, HandEye
 
 Floats = NDArray[np.float64]
 
@@ -387,7 +387,7 @@ def solve_hand_eye(
     sizes = np.linalg.norm(found.linear.residuals, axis=-1)
     for i, view in enumerate(views):
         spheres = tuple(
-            SphereFit(
+            ArtefactSphere(
                 centre_mm=problem.seen[i, j],
                 covariance_mm2=problem.seen_cov[i, j],
                 rms_mm=view.rms_mm[j],

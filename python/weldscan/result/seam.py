@@ -1,0 +1,59 @@
+"""The seam by bins: what became of every pixel, how much was seen, how much had to be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+WHOLE_TURN_DEG = 360.0
+
+
+FATES = (
+    *("wall", "transition", "cap", "gated", "off_line", "dark", "saturated", "order_in_doubt", "two_paths"),
+    *("outside_calibration", "hidden", "other"),
+)
+"""What became of a pixel of a part shot, by contract."""
+
+
+@dataclass(frozen=True)
+class SeamBin:
+    """One bin of the seam that was required or seen, and what became of every pixel in it."""
+
+    angle_deg: float
+    along_mm: float
+    """From the zero mark along the seam."""
+    measured: bool
+    fate: dict[str, int]
+    """Pixels by `FATES`, over all part shots."""
+    cap_width_mm: float | None = None
+    toes_mm: tuple[float, float] | None = None
+    """Both toes, along the axis from the seam's centreline: reference side, other side."""
+
+
+def along_seam_mm(angle_deg: float, part: Mapping[str, Any]) -> float | None:
+    """Length along the seam of a pipe from its zero mark, on the rated outside; None where no diameter is known.
+
+    >>> round(along_seam_mm(90.0, {"outside_diameter": 400.0}), 3)
+    314.159
+    """
+    diameter = part.get("outside_diameter")
+    return None if not diameter else math.radians(angle_deg % 360) * diameter / 2
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How much of the seam was seen, and how much had to be."""
+
+    seen_deg: float
+    required_deg: float
+    required_by: str
+    """session, option, or views: what these views should have seen."""
+    gaps: tuple[tuple[float, float], ...]
+    """Arcs that were required and not seen, from, to, degrees, in the direction of growing angle."""
+
+    @property
+    def enough(self) -> bool:
+        """Whether all that is required was seen."""
+        return not self.gaps and self.seen_deg >= self.required_deg

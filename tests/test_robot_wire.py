@@ -20,6 +20,7 @@ from weldscan.devices.robots.serial import checksum, cut_line, decode_line, enco
 from weldscan.devices.robots.wire import cut_xml, parse_xml
 from weldscan.simulated.controllers import Arm, Fault
 from weldscan.simulated.controllers.eki import EkiController, EkiUdpController
+from weldscan.simulated.controllers.kvp import KvpController
 from weldscan.simulated.controllers.rsi import RsiController
 
 POSE = KukaPose(610.825, -148.476, 481.652, -29.008, 23.236, 74.641)
@@ -136,7 +137,7 @@ def test_unknown_variable_is_an_error_with_either_dialect():
     for c3 in (False, True):
         dialect = "c3" if c3 else "kukavarproxy"
         with (
-            kvp.KvpController(c3=c3) as controller,
+            KvpController(c3=c3) as controller,
             kvp.KvpRobot(kvp.KvpSettings(port=controller.port, dialect=dialect)) as robot,
             pytest.raises(DeviceError),
         ):

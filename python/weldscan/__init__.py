@@ -137,6 +137,9 @@ _LAZY = {
     "weldscan.measure.scanner_standing": ("standing_of",),
 }
 
+# The algorithms by room: each a module that gives its names.
+_ROOMS = ("_weldcore", "clouds", "fringes", "scanner", "surfaces", "weld")
+
 
 def __getattr__(name: str) -> "Any":
     from importlib import import_module
@@ -145,7 +148,7 @@ def __getattr__(name: str) -> "Any":
         module = next((module for module, names in _LAZY.items() if name in names), "weldscan._weldcore")
         value = globals()[name] = getattr(import_module(module), name)
         return value
-    if f"weldscan.{name}" in _LAZY or name == "_weldcore":
+    if f"weldscan.{name}" in _LAZY or name in _ROOMS:
         return import_module(f"weldscan.{name}")
     raise AttributeError(f"module 'weldscan' has no attribute {name!r}")
 

@@ -26,6 +26,7 @@ def _one(job: tuple[str, int, bool]) -> dict:
     import weldscan
     from weldscan.errors import WeldscanError
     from weldscan.measure.inspection import inspect
+    from weldscan.measure.journal import Journal, ShotReading
     from weldscan.measure.session_points import MASKS, PointReader, Scan
     from weldscan.simulated import scenes
 
@@ -41,13 +42,13 @@ def _one(job: tuple[str, int, bool]) -> dict:
     class FromScene(PointReader):
         """Gives the scene's clouds."""
 
-        def __call__(self, shot):
+        def __call__(self, shot, done=0):
             if not hasattr(self, "clouds"):
                 self.clouds = {each.name: each for each in scenes.views(scene)}
             seen = self.clouds[shot.name]
             counts = np.bincount(seen.reason.ravel(), minlength=len(MASKS))
-            self.masks[shot.name] = dict(zip(MASKS, counts.tolist(), strict=True))
-            return Scan(seen.points_mm, None, seen.reason, shot.name)
+            reading = ShotReading(shot.name, dict(zip(MASKS, counts.tolist(), strict=True)), shot.name)
+            return Scan(seen.points_mm, None, seen.reason, reading, Journal(shots=(reading,)))
 
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:

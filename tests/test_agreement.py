@@ -117,7 +117,7 @@ def test_a_part_that_was_moved_by_little_is_a_warning_and_by_much_a_bar(recorded
 
 
 def test_the_hand_eye_of_another_cell_shows_in_all_shots(recorded: Path, tmp_path: Path) -> None:
-    write_hand_eye(tmp_path / "hand-eye.json", calibrate(recorded))
+    write_hand_eye(tmp_path / "hand-eye.json", calibrate(recorded)[0])
     kept = json.loads((tmp_path / "hand-eye.json").read_text())
 
     def carry(turn_rad: float) -> Change:

@@ -455,9 +455,8 @@ def test_a_session_whose_spheres_nobody_touched(tmp_path):
     shutil.copytree(tmp_path / "session" / "shots" / "artefact-5", tmp_path / "session" / "shots" / "again")
     del document["artefact"]["centres_base"]
     path.write_text(json.dumps(document))
-    left_out: list[tuple[str, str]] = []
-    found = calibrate(tmp_path / "session", left_out=left_out)
-    assert left_out == [("again", "is artefact-5 once more: a shot counts once")]
+    found, noticed = calibrate(tmp_path / "session")
+    assert noticed.left_out == (("again", "is artefact-5 once more: a shot counts once"),)
     off = (found.flange_from_scanner - TRUE) @ [*WORKING_POINT_MM, 1.0]
     assert np.linalg.norm(off) < 3 * found.working_point_u_mm < 0.5
     document["shots"] = shots[:4]

@@ -216,7 +216,7 @@ def test_one_artefact_shot_suffices_with_a_wider_uncertainty(recorded, tmp_path)
 
 def test_a_hand_eye_inside_the_session_serves_as_well(recorded, tmp_path):
     folder, _, before = recorded
-    write_hand_eye(tmp_path / "hand-eye.json", calibrate(folder))
+    write_hand_eye(tmp_path / "hand-eye.json", calibrate(folder)[0])
 
     def carry(document):
         document["hand_eye"] = json.loads((tmp_path / "hand-eye.json").read_text())

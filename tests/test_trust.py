@@ -10,6 +10,7 @@ import pytest
 
 from conftest import shared
 from weldscan.measure.inspection import inspect
+from weldscan.measure.journal import Journal, ShotReading
 from weldscan.measure.session_points import MASKS, PointReader, Scan
 from weldscan.result import FATES, Verdict
 from weldscan.simulated import scenes
@@ -61,11 +62,11 @@ class FromScene(PointReader):
 
     clouds: dict[str, scenes.Shot]
 
-    def __call__(self, shot):
+    def __call__(self, shot, done=0):
         seen = self.clouds[shot.name]
         counts = np.bincount(seen.reason.ravel(), minlength=len(MASKS)).tolist()
-        self.masks[shot.name] = dict(zip(MASKS, counts, strict=True))
-        return Scan(seen.points_mm, None, seen.reason, shot.name)
+        reading = ShotReading(shot.name, dict(zip(MASKS, counts, strict=True)), shot.name)
+        return Scan(seen.points_mm, None, seen.reason, reading, Journal(shots=(reading,)))
 
 
 def inspected(kind, seed, tmp_path, change=lambda clouds: None, **asked):

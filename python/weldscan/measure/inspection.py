@@ -9,18 +9,19 @@ import math
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime
 from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import __version__, measure_step, place_shots, segment_weld
+from weldscan._weldcore import WeldShot, __version__, measure_step, place_shots, segment_weld
 from weldscan.calibration.hand_eye import point_uncertainty_mm, pose_sigma
 from weldscan.errors import GeometryError, InputError
 from weldscan.measure.calibration_margin import CalibrationMargin, Unevenness, calibration_above, calibration_margin
+from weldscan.measure.journal import Journal, SetPhaseError, ShotReading, took
 from weldscan.measure.observable_terms import seam_terms
 from weldscan.measure.paper_method import paper_step
 from weldscan.measure.part_views import PartView
@@ -111,19 +112,34 @@ def inspect(
         True
     """
     run = _Run(folder, method, norms, response, progress, history, accept_verification, required_coverage_deg, reader)
+    noticed = run.noticed
     # 1-4  the three-sphere plate in every artefact shot: where the scanner sits on the flange
-    hand_eye = hand_eye_of(run.read, run.left_out)
+    hand_eye, more = hand_eye_of(run.read, run.unusable)
+    noticed += more
     # 5-6  every part shot: its points, its place in base, reference wall, other wall and bead
-    welds = [weld for shot in run.part_shots if (weld := run.weld(shot, hand_eye)) is not None]
+    views, more = run.part_views(hand_eye, len(noticed.shots))
+    noticed += more
     # 7    the step: all shots in one model, each against its own reference wall; the surfaces beside the toes; what
     #      became of every pixel; and the paper's chain
-    step, cloud = run.measure(welds, hand_eye)
+    measured, more = run.measure(views, hand_eye)
+    noticed += more
     # 8    the verdict
-    return run.judged(step, cloud, hand_eye)
+    return run.judged(measured, hand_eye, noticed)
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """What all part shots together gave."""
+
+    step: StepResult | None = None
+    cloud: PartCloud | None = None
+    seam: Seam | None = None
+    calibration: CalibrationMargin | None = None
+    agreement: tuple[ShotAgreement, ...] = ()
 
 
 class _Run:
-    """One inspection under way: the session, and what went wrong."""
+    """One inspection: what was asked, the session, and what that says before anything is measured."""
 
     def __init__(
         self,
@@ -152,39 +168,49 @@ class _Run:
         self.standing = standing_of(self.session, history, accept_verification)
         self.response = response
         self.read = reader(self.session, progress, _compensation(response))
-        self.seam: Seam | None = None
-        self.calibration: CalibrationMargin | None = None
-        self.agreement: tuple[ShotAgreement, ...] = ()
         faults = faults_of(self.session.folder)
-        self.left_out: list[tuple[str, str]] = [(fault.shot, fault.reason) for fault in faults]
-        self.read.findings += held_against_itself(self.session) + held_against_record(self.session, faults)
-        unusable = {name for name, _ in self.left_out}
-        self.part_shots = [shot for shot in self.session.part_shots if shot.name not in unusable]
+        self.unusable = {fault.shot for fault in faults}
+        self.noticed = Journal(
+            (*held_against_itself(self.session), *held_against_record(self.session, faults)),
+            tuple((fault.shot, fault.reason) for fault in faults),
+        )
 
-    def weld(self, shot: ShotSpec, hand_eye: HandEye | None) -> PartView | None:
-        """Steps 5 and 6: one part shot, placed and segmented; None with the reason kept."""
+    def part_views(self, hand_eye: HandEye | None, done: int) -> tuple[list[PartView], Journal]:
+        """Steps 5 and 6: every usable part shot, placed and segmented; `done` shots were read before."""
+        views: list[PartView] = []
+        noticed = Journal()
+        for shot in self.session.part_shots:
+            if shot.name not in self.unusable:
+                view, more = self.part_view(shot, hand_eye, done + len(noticed.shots))
+                noticed += more
+                if view is not None:
+                    views.append(view)
+        return views, noticed
+
+    def part_view(self, shot: ShotSpec, hand_eye: HandEye | None, done: int) -> tuple[PartView | None, Journal]:
+        """One of them; None with the reason in the journal."""
         base_from_scanner = np.eye(4)
         if self.session.has_robot:
             if hand_eye is None:
-                self.left_out.append((shot.name, "no artefact shot could be used, so its place in base is unknown"))
-                return None
+                why = "no artefact shot could be used, so its place in base is unknown"
+                return None, Journal(left_out=((shot.name, why),))
             base_from_scanner = base_from_flange(shot) @ hand_eye.flange_from_scanner
-        scan = self.read(shot)
+        scan = self.read(shot, done)
         t = time.perf_counter()
         part, turn = self.part, base_from_scanner[:3, :3].T
         axis, zero = (None if v is None else (turn @ np.array(v)).tolist() for v in (part.axis_base, part.zero_base))
+        segmented: WeldShot | None = None
+        refused: str | None = None
         try:
             segmented = segment_weld(scan.points_mm, part.outside_diameter / 2, part.wall_thickness, axis, zero)
         except GeometryError as error:
-            why = self.read.why_dark(shot) or other_part(scan.points_mm, part, axis) or str(error)
-            self.left_out.append((shot.name, why))
-            return None
-        finally:
-            self.read.clock("segment", t)
-        if (other := other_part(scan.points_mm, part, axis, segmented)) is not None:
-            self.left_out.append((shot.name, other))
-            return None
-        return PartView(
+            refused = scan.reading.why_dark or other_part(scan.points_mm, part, axis) or str(error)
+        noticed = scan.noticed + took("segment", t)
+        if segmented is not None:
+            refused = other_part(scan.points_mm, part, axis, segmented)
+        if segmented is None or refused is not None:
+            return None, noticed + Journal(left_out=((shot.name, str(refused)),))
+        view = PartView(
             shot.name,
             self.session.part_shots.index(shot),
             scan.points_mm,
@@ -193,65 +219,66 @@ class _Run:
             base_from_scanner,
             segmented,
         )
+        return view, noticed
 
-    def measure(
-        self, welds: Sequence[PartView], hand_eye: HandEye | None
-    ) -> tuple[StepResult | None, PartCloud | None]:
+    def measure(self, views: Sequence[PartView], hand_eye: HandEye | None) -> tuple[_Measured, Journal]:
         """Step 7, both methods."""
-        if not welds:
-            return None, None
-        self.read.findings += held_against_scan(self.session, welds, hand_eye)
+        if not views:
+            return _Measured(), Journal()
+        noticed = Journal(tuple(held_against_scan(self.session, views, hand_eye)))
         t = time.perf_counter()
         angle_sigma = 0.0
         if hand_eye is not None:
             turn = float(np.linalg.eigvalsh(hand_eye.covariance[:3, :3]).max())
             angle_sigma = float(np.sqrt(max(turn, 0.0) + pose_sigma(hand_eye)[1] ** 2))
         try:
-            step = measure_step([weld.shot for weld in welds], angle_sigma_rad=angle_sigma)
+            step = measure_step([view.shot for view in views], angle_sigma_rad=angle_sigma)
         except GeometryError as error:
-            self.left_out.extend((self.session.part_shots[weld.index].name, str(error)) for weld in welds)
-            return None, None
-        edges = edge_profile(welds)
+            return _Measured(), noticed + Journal(left_out=tuple((view.name, str(error)) for view in views))
+        edges = edge_profile(views)
         found = _step_result(step, edges, self.part)
-        t = self.read.clock("measure", t)
+        noticed, t = noticed + took("measure", t), time.perf_counter()
         measured = np.rint(found.angle_deg / BIN_DEG).astype(int).tolist()
         by = "session" if self.required_coverage_deg is None else "option"
         required = self.required_deg
-        self.seam = seam_of(
-            welds,
+        seam = seam_of(
+            views,
             self.read.scanner,
             measured,
             self.part.outside_diameter / 2,
             required,
             "views" if required is None else by,
         )
-        self.read.findings += self.seam.findings
-        self.calibration = calibration_margin(
+        margin = calibration_margin(
             self.session.scanner,
             self.read.scanner,
-            welds,
+            views,
             found.angle_deg,
             self.part.wall_thickness,
             Unevenness(step["residual_rms_mm"], *step["correlation_mm"]),
             self.read.axis,
         )
-        t = self.read.clock("seam", t)
+        noticed, t = noticed + Journal(seam.findings) + took("seam", t), time.perf_counter()
         deviations = step["deviation_mm"]
         cloud = PartCloud(
             *place_shots(
-                [(w.shot, w.points_mm, w.base_from_scanner, d, w.index) for w, d in zip(welds, deviations, strict=True)]
+                [(v.shot, v.points_mm, v.base_from_scanner, d, v.index) for v, d in zip(views, deviations, strict=True)]
             )
         )
-        t = self.read.clock("place", t)
-        if hand_eye is not None and len(welds) > 1:
-            self.hold_together(cloud, welds, hand_eye)
-            t = self.read.clock("agreement", t)
-        histogram = self.paper(cloud, welds[0])
-        self.read.clock("paper", t)
+        noticed, t = noticed + took("place", t), time.perf_counter()
+        agreements: tuple[ShotAgreement, ...] = ()
+        if hand_eye is not None and len(views) > 1:
+            agreements, said = self.hold_together(cloud, views, hand_eye)
+            noticed, t = noticed + Journal(said) + took("agreement", t), time.perf_counter()
+        histogram, said = self.paper(cloud, views[0])
+        noticed += Journal(said) + took("paper", t)
         if not found.angle_deg.size:
-            self.left_out.extend((weld.name, "no angle at which both walls and both edges were seen") for weld in welds)
-            return None, cloud
-        return replace(found, histogram=histogram), cloud
+            why = "no angle at which both walls and both edges were seen"
+            return (
+                _Measured(None, cloud, seam, margin, agreements),
+                noticed + Journal(left_out=tuple((view.name, why) for view in views)),
+            )
+        return _Measured(replace(found, histogram=histogram), cloud, seam, margin, agreements), noticed
 
     @property
     def required_deg(self) -> float | None:
@@ -259,27 +286,29 @@ class _Run:
         asked = self.required_coverage_deg
         return self.part.required_coverage_deg if asked is None else asked
 
-    def hold_together(self, cloud: PartCloud, welds: Sequence[PartView], hand_eye: HandEye) -> None:
+    def hold_together(
+        self, cloud: PartCloud, views: Sequence[PartView], hand_eye: HandEye
+    ) -> tuple[tuple[ShotAgreement, ...], tuple[Finding, ...]]:
         """Shots that saw the same wall, held against each other in base."""
-        shots = [(w.index, self.session.part_shots[w.index]) for w in welds]
+        shots = [(view.index, self.session.part_shots[view.index]) for view in views]
         placed = [PlacedShot(shot.name, index, base_from_flange(shot)) for index, shot in shots]
-        self.agreement = agreement(cloud, placed, hand_eye, *welds[0].axis_in_base)
-        self.read.findings += [said for pair in self.agreement if (said := complaint(pair)) is not None]
-        self.read.findings += shots_agree(welds, hand_eye)
+        pairs = agreement(cloud, placed, hand_eye, *views[0].axis_in_base)
+        said = [said for pair in pairs if (said := complaint(pair)) is not None]
+        return pairs, (*said, *shots_agree(views, hand_eye))
 
-    def paper(self, cloud: PartCloud, weld: PartView) -> Histogram | None:
-        """The paper's chain; None with a warning where it finds no answer."""
-        origin, axis = weld.axis_in_base
+    def paper(self, cloud: PartCloud, view: PartView) -> tuple[Histogram | None, tuple[Finding, ...]]:
+        """The paper's chain; None with a note where it finds no answer."""
+        origin, axis = view.axis_in_base
         try:
-            return paper_step(cloud.points_mm, origin, axis, weld.shot.radius_mm)
+            return paper_step(cloud.points_mm, origin, axis, view.shot.radius_mm), ()
         except GeometryError as error:
-            self.read.findings.append(note("paper", f"method paper gave no answer: {error}"))
-            return None
+            return None, (note("paper", f"method paper gave no answer: {error}"),)
 
-    def judged(self, step: StepResult | None, cloud: PartCloud | None, hand_eye: HandEye | None) -> Inspection:
+    def judged(self, measured: _Measured, hand_eye: HandEye | None, noticed: Journal) -> Inspection:
         """Step 8, and everything together."""
-        self.read.findings += copies(self.read.digests)
-        self.read.findings += not_used(self.session, self.left_out, self.read.findings)
+        step, cloud, seam = measured.step, measured.cloud, measured.seam
+        findings = [*noticed.findings, *copies({shot.name: shot.digest for shot in noticed.shots})]
+        findings += not_used(self.session, noticed.left_out, findings)
         value, expanded, coverage = None, None, None
         if step is not None:
             if step.histogram is not None:
@@ -290,20 +319,21 @@ class _Run:
                 value = None if step.histogram is None else step.histogram.step_mm
                 expanded = None if step.histogram is None else step.histogram.expanded_uncertainty_mm
         part = self.part.model_dump()
-        reason = "; ".join(f"{name}: {why}" for name, why in self.left_out) or "method paper gave no answer"
+        reason = "; ".join(f"{name}: {why}" for name, why in noticed.left_out) or "method paper gave no answer"
         if not self.standing.relied_on:
             value, expanded = None, None
             reason = f"the scanner is not verified: {self.standing.text}"
         # Whatever finds something stands before the verdict: a bar found later would not count.
-        scanner = self.scanner_record()
-        compensated = response_record(self.response, self.read.phase_errors)
+        scanner, said = self.scanner_record()
+        findings += said
+        compensated = response_record(self.response, noticed.shots)
         if compensated["note"]:
-            self.read.findings.append(note("response", compensated["note"]))
-        if (said := about_verification(self.standing)) is not None:
-            self.read.findings.append(said)
-        common = list(self.read.findings)
-        doubts = {norm: self.doubts_of(norm, step, value, expanded) for norm in self.norms}
-        self.read.findings += dict.fromkeys(said for found in doubts.values() for said in found)
+            findings.append(note("response", compensated["note"]))
+        if (about := about_verification(self.standing)) is not None:
+            findings.append(about)
+        common = list(findings)
+        doubts = {norm: self.doubts_of(norm, measured, value, expanded) for norm in self.norms}
+        findings += dict.fromkeys(said for found in doubts.values() for said in found)
         verdicts = [
             verdict
             for norm in self.norms
@@ -318,7 +348,7 @@ class _Run:
                 bars=[*common, *doubts[norm]],
             )
         ]
-        timing = self.read.timing
+        timing = dict(noticed.timing_s)
         timing["compute"] = sum(seconds for what, seconds in timing.items() if what != "read")
         return Inspection(
             session=self.session.name,
@@ -329,9 +359,9 @@ class _Run:
             hand_eye=hand_eye,
             cloud=cloud,
             verdicts=tuple(verdicts),
-            left_out=tuple(self.left_out),
-            findings=tuple(self.read.findings),
-            masks=self.read.masks,
+            left_out=noticed.left_out,
+            findings=tuple(findings),
+            masks={shot.name: dict(shot.masks) for shot in noticed.shots},
             response=compensated,
             timing_s=timing,
             software={
@@ -342,23 +372,24 @@ class _Run:
                 "session_sha256": self.session.sha256,
             },
             verification=self.standing,
-            agreement=self.agreement,
+            agreement=measured.agreement,
             scanner=scanner,
-            seam=self.seam.bins if self.seam else (),
-            coverage=self.seam.coverage if self.seam else None,
+            seam=seam.bins if seam else (),
+            coverage=seam.coverage if seam else None,
         )
 
     def doubts_of(
-        self, norm: str, step: StepResult | None, value_mm: float | None, expanded_mm: float | None
+        self, norm: str, measured: _Measured, value_mm: float | None, expanded_mm: float | None
     ) -> list[Finding]:
         """What bars PASS under one norm alone: whether it does depends on the limit."""
         limits = [each.limit_mm for each in judge(norm, 0.0, 0.0, self.part.model_dump()) if each.limit_mm is not None]
+        step = measured.step
         if step is None or not limits:
             return []
         limit_mm = min(limits)
         found = [self.edges_above(limit_mm, step)]
         if value_mm is not None and expanded_mm is not None:
-            found.append(calibration_above(self.calibration, limit_mm, abs(value_mm) + expanded_mm))
+            found.append(calibration_above(measured.calibration, limit_mm, abs(value_mm) + expanded_mm))
         return [said for said in found if said is not None]
 
     def edges_above(self, limit_mm: float, step: StepResult) -> Finding | None:
@@ -373,22 +404,23 @@ class _Run:
         )
         return bar("edges", text)
 
-    def scanner_record(self) -> ScannerRecord | None:
+    def scanner_record(self) -> tuple[ScannerRecord | None, tuple[Finding, ...]]:
         """Which calibration of the scanner this is, where the session says; with a warning where it is out of date."""
         spec = self.session.scanner
         if spec.id is None:
-            return None
+            return None, ()
+        said = []
         expired = spec.valid_until is not None and date.fromisoformat(spec.valid_until) < datetime.now(UTC).date()
         if expired:
             text = (
                 f"the scanner's calibration {spec.id} of {(spec.date or 'an unknown day')[:10]} was valid until "
                 f"{spec.valid_until}: it is out of date"
             )
-            self.read.findings.append(warning("calibration", text))
+            said.append(warning("calibration", text))
         if spec.undetermined:
             text = f"the scanner's calibration {spec.id} did not determine {', '.join(spec.undetermined)}"
-            self.read.findings.append(warning("calibration", text))
-        return ScannerRecord(
+            said.append(warning("calibration", text))
+        record = ScannerRecord(
             spec.id,
             spec.date or "",
             spec.valid_until,
@@ -397,6 +429,7 @@ class _Run:
             spec.temperature_c,
             spec.undetermined or (),
         )
+        return record, tuple(said)
 
     def paper_uncertainty_mm(self, step: StepResult, cloud: PartCloud | None, hand_eye: HandEye | None) -> float | None:
         """Expanded, k = 2: the surface's, the robot through which the paper's chain joins shots, and its bias.
@@ -433,18 +466,17 @@ def _compensation(response: str | os.PathLike[str] | Response) -> Compensate:
     return lambda fringe: table.phase_error(fringe.steps, fringe.periods)
 
 
-def response_record(
-    response: str | os.PathLike[str] | Response, errors: Mapping[str, list[dict[str, Any]]]
-) -> dict[str, Any]:
+def response_record(response: str | os.PathLike[str] | Response, shots: Sequence[ShotReading]) -> dict[str, Any]:
     """What was done about the projector's response, for the result: how, how much, in which shots; and a line."""
-    taken = {name: [e for e in sets if e["from"] != "nothing"] for name, sets in errors.items()}
+    errors = {shot.name: shot.phase_errors for shot in shots if shot.phase_errors is not None}
+    taken = {name: [e for e in sets if e.source != "nothing"] for name, sets in errors.items()}
     taken = {name: sets for name, sets in taken.items() if sets}
     record: dict[str, Any] = {
         "mode": response if response in ("auto", "off") else "table",
         "table": None,
         "compensated": sorted(taken),
-        "largest_rad": max((e["largest_rad"] for sets in taken.values() for e in sets), default=0.0),
-        "shots": dict(errors),
+        "largest_rad": max((e.largest_rad for sets in taken.values() for e in sets), default=0.0),
+        "shots": {name: [_set_record(e) for e in sets] for name, sets in errors.items()},
         "note": None,
     }
     if isinstance(response, Response):
@@ -464,6 +496,18 @@ def response_record(
             f"was compensated, {by}, by up to {record['largest_rad']:.4f} rad"
         )
     return record
+
+
+def _set_record(error: SetPhaseError) -> dict[str, Any]:
+    return {
+        "periods": error.periods,
+        "steps": error.steps,
+        "from": error.source,
+        "largest_rad": error.largest_rad,
+        "sin_rad": list(error.sin_rad),
+        "standard_rad": list(error.standard_rad),
+        "harmonics": error.harmonics,
+    }
 
 
 BUDGET = (

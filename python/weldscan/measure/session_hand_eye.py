@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from weldscan.calibration.artefact import TOUCH_SIGMA_MM, PlateMismatch, PlateView, find_plate
 from weldscan.calibration.hand_eye import POSE_SIGMA_MM, POSE_SIGMA_RAD, TOUCH_BIAS_SIGMA_MM, solve_hand_eye
 from weldscan.errors import GeometryError, InputError, NotMeasured
+from weldscan.measure.journal import Journal, took
 from weldscan.measure.session_points import PointReader, Progress
 from weldscan.pose import matrix_from_kuka
 from weldscan.records.hand_eye import HandEyeSpec, named_hand_eye
@@ -31,62 +33,62 @@ def base_from_flange(shot: ShotSpec) -> Floats:
     return matrix_from_kuka(pose.X, pose.Y, pose.Z, pose.A, pose.B, pose.C)
 
 
-def hand_eye_of(read: PointReader, left_out: list[tuple[str, str]]) -> HandEye | None:
+def hand_eye_of(read: PointReader, unusable: Collection[str] = ()) -> tuple[HandEye | None, Journal]:
     """The session's hand-eye: the one that it carries, else the one that its artefact shots give.
 
     Args:
         read: gives the shots' points.
-        left_out: gets the artefact shots that could not be used, with the reason.
+        unusable: names of shots that are not to be read.
 
     Returns:
-        HandEye; None without a robot, or where no artefact shot could be used.
+        HandEye, None without a robot or where no artefact shot could be used; and what was noticed.
 
     Raises:
         PlateMismatch: the plate in view is not the one described, in no shot, or contradicts the poses.
     """
     session: Session = read.session
+    noticed = Journal()
     if isinstance(session.hand_eye, HandEyeSpec):
         if not np.any(session.hand_eye.covariance):
-            read.findings.append(
-                warning("hand-eye", "hand_eye.covariance: is zero, so U holds nothing of the hand-eye")
-            )
-        return session.hand_eye.build()
+            text = "hand_eye.covariance: is zero, so U holds nothing of the hand-eye"
+            noticed += Journal((warning("hand-eye", text),))
+        return session.hand_eye.build(), noticed
     if session.artefact is None or not session.artefact_shots:
-        return None
+        return None, noticed
     artefact, robot = session.artefact, session.robot
     touched = None if artefact.centres_base is None else np.array(artefact.centres_base)
     views: list[PlateView] = []
     poses: list[Floats] = []
     mistaken: PlateMismatch | None = None
-    unusable = {name for name, _ in left_out}
     for shot in session.artefact_shots:
         if shot.name in unusable:
             continue
-        pose, cloud = base_from_flange(shot), read(shot)
+        pose, scan = base_from_flange(shot), read(shot, len(noticed.shots))
+        noticed += scan.noticed
         t = time.perf_counter()
         # Spheres that were not touched are told apart as the first shot has them.
         reference = touched if touched is not None else views[0].centres_mm if views else None
         eye = pose if touched is not None else np.eye(4)
+        why: str | None = None
         try:
-            view = find_plate(shot.name, cloud.points_mm, artefact.sphere_diameter, reference, eye)
+            view = find_plate(shot.name, scan.points_mm, artefact.sphere_diameter, reference, eye)
         except PlateMismatch as error:
-            mistaken = error
-            left_out.append((shot.name, str(error)))
+            mistaken, why = error, str(error)
         except GeometryError as error:
-            left_out.append((shot.name, read.why_dark(shot) or str(error)))
+            why = scan.reading.why_dark or str(error)
         else:
             twin = next((v.shot for v in views if np.array_equal(v.centres_mm, view.centres_mm)), None)
             if twin is None:
                 views.append(view)
                 poses.append(pose)
             else:
-                left_out.append((shot.name, f"is {twin} once more: a shot counts once"))
-        read.clock("spheres", t)
+                why = f"is {twin} once more: a shot counts once"
+        noticed += took("spheres", t) + Journal(left_out=() if why is None else ((shot.name, why),))
     where = session.folder / "session.json"
     if not views:
         if mistaken is not None:
             raise PlateMismatch(f"{where}: {mistaken}")
-        return None
+        return None, noticed
     t = time.perf_counter()
     try:
         solved = solve_hand_eye(
@@ -102,21 +104,20 @@ def hand_eye_of(read: PointReader, left_out: list[tuple[str, str]]) -> HandEye |
         raise PlateMismatch(f"{where}: {error}") from None
     except (InputError, GeometryError) as error:
         raise InputError(f"{where}: shots: {error}") from None
-    left_out.extend((shot.shot, shot.outlier) for shot in solved.per_shot if shot.outlier is not None)
-    read.findings.extend(warning("hand-eye", f"hand-eye: {text}") for text in solved.warnings)
-    read.clock("hand_eye", t)
-    return solved
+    said = tuple(warning("hand-eye", f"hand-eye: {text}") for text in solved.warnings)
+    outliers = tuple((shot.shot, shot.outlier) for shot in solved.per_shot if shot.outlier is not None)
+    return solved, noticed + Journal(said, outliers) + took("hand_eye", t)
 
 
-def calibrate(
-    session_folder: Path | str, progress: Progress | None = None, left_out: list[tuple[str, str]] | None = None
-) -> HandEye:
+def calibrate(session_folder: Path | str, progress: Progress | None = None) -> tuple[HandEye, Journal]:
     """flange_from_scanner from the artefact shots of a session (`weldscan calibrate hand-eye`).
 
     Args:
         session_folder: a `weldscan-session/1` folder with artefact shots; others in it are not looked at.
         progress: called with (done, total, what).
-        left_out: gets the shots that were not used, with the reason.
+
+    Returns:
+        HandEye; and what was noticed, the shots that were not used among it.
 
     Raises:
         InputError: the session is wrong, or the plate in view is not the one that it describes.
@@ -125,11 +126,10 @@ def calibrate(
     session = read_session(session_folder)
     if not session.artefact_shots:
         raise InputError(f"{session.folder / 'session.json'}: shots: none is of the artefact")
-    left_out = [] if left_out is None else left_out
-    found = hand_eye_of(PointReader(session, progress), left_out)
+    found, noticed = hand_eye_of(PointReader(session, progress))
     if found is None:
-        raise NotMeasured("; ".join(f"{name}: {why}" for name, why in left_out))
-    return found
+        raise NotMeasured("; ".join(f"{name}: {why}" for name, why in noticed.left_out))
+    return found, noticed
 
 
 def mounted(source: PlanSource, path: str | os.PathLike[str]) -> Floats:
@@ -139,7 +139,7 @@ def mounted(source: PlanSource, path: str | os.PathLike[str]) -> Floats:
         file = path / "session.json" if path.is_dir() else path
         return np.array(named_hand_eye(file, source.hand_eye).flange_from_scanner)
     if path.is_dir() and any(shot.of == "artefact" for shot in source.shots):
-        return calibrate(path).flange_from_scanner
+        return calibrate(path)[0].flange_from_scanner
     raise InputError(
         f"{path}: hand_eye: missing; say roughly where the scanner sits on the flange with --mount 'X Y Z A B C' "
         "(mm and degrees, the drawing's are good enough) or --hand-eye FILE"

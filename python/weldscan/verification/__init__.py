@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from weldscan._weldcore import __version__
 from weldscan.calibration.artefact import PlateMismatch
 from weldscan.errors import GeometryError, InputError
+from weldscan.measure.journal import Journal
 from weldscan.measure.scanner_standing import CLOCK_SKEW, fringes_of, scanner_id
 from weldscan.measure.session_hand_eye import base_from_flange
 from weldscan.measure.session_points import PointReader, Progress
@@ -228,7 +229,7 @@ def verify(
         raise InputError(f"{where}: shots: none is of the artefact or of a plane, so there is nothing to verify by")
     now = datetime.now(UTC)
     recorded, date_from = _date(session, date, now)
-    read = PointReader(session, progress)
+    read, noticed = PointReader(session, progress), Journal()
     lens = read.scanner.camera
     broken = dict(left_out(session.folder))
     balls: list[BallError] = []
@@ -240,7 +241,8 @@ def verify(
         if shot.name in broken:
             lost[shot.name] = broken[shot.name]
             continue
-        points = read(shot).points_mm
+        scan = read(shot, len(noticed.shots))
+        points, noticed = scan.points_mm, noticed + scan.noticed
         try:
             if shot.of == "plane":
                 planes.append(plane_error(shot.name, points, lens, session.plane, kept.share))
@@ -253,7 +255,7 @@ def verify(
         except PlateMismatch as error:
             mistaken, lost[shot.name] = error, str(error)
         except GeometryError as error:
-            lost[shot.name] = read.why_dark(shot) or str(error)
+            lost[shot.name] = scan.reading.why_dark or str(error)
     if mistaken is not None and not balls:
         raise PlateMismatch(f"{where}: {mistaken}")
     lost.update({name: why for name, why in broken.items() if name not in lost})
@@ -261,7 +263,7 @@ def verify(
     short = min((plane.of_field for plane in planes), default=1.0)
     if short < HALF_FIELD:
         text = f"a plane spans {100 * short:.0f} % of the field's diagonal: VDI/VDE 2634-2 asks for half (unverified)"
-        read.findings.append(warning("verification", text))
+        noticed += Journal((warning("verification", text),))
     valid_until = recorded + timedelta(days=kept.validity_days)
     return Verification(
         session=session.name,
@@ -275,7 +277,7 @@ def verify(
         planes=tuple(planes),
         lost=tuple(lost.items()),
         assumed=assumed,
-        warnings=tuple(finding.text for finding in read.findings),
+        warnings=tuple(finding.text for finding in noticed.findings),
         limits=kept.model_dump(exclude={"history"}),
         fringes=fringes_of(session),
         software={

@@ -6,6 +6,7 @@ As in `weldscan.faces.cli.app`, heavy imports happen inside the commands.
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -55,13 +56,12 @@ def hand_eye(
 
     page = page if page is not None else out.with_suffix(".html")
     check_page(page)
-    left_out: list[tuple[str, str]] = []
     with shown_progress() as progress:
-        found = solve(session, progress, left_out)
+        found, noticed = solve(session, progress)
     write_hand_eye(out, found)
     write_hand_eye_page(found, page, session.resolve().name)
     with terminal.answer():
-        _show_hand_eye(found, left_out)
+        _show_hand_eye(found, noticed.left_out)
         print(f'         kept in {out}; a session carries it as "hand_eye": "{out.name}"')
         print(f"         page: {page}")
 
@@ -170,7 +170,7 @@ def _show_plan(found: Plan) -> None:
         print(f"         {count} poses dropped: {reason}")
 
 
-def _show_hand_eye(found: HandEye, left_out: list[tuple[str, str]]) -> None:
+def _show_hand_eye(found: HandEye, left_out: Sequence[tuple[str, str]]) -> None:
     """The figures of a hand-eye calibration, shot by shot."""
     import math
 

@@ -122,9 +122,12 @@ def calibrate_scanner(
         stack = read_stack(captures, pose, size)
         size, first = stack.size, first or stack
         try:
-            views.append(_view(pose, stack, wanted, warnings))
+            view, said = _view(pose, stack, wanted)
         except GeometryError as error:
             left_out.append((pose.name, str(error)))
+        else:
+            views.append(view)
+            warnings += said
     tell(len(captures.poses), len(captures.poses) + 1, "adjustment")
     where = captures.folder
     if not views and first is not None and wanted.kind == "chessboard":
@@ -237,8 +240,8 @@ def _board_of(captures: Captures, board: str | Board | None) -> Board:
     return wanted
 
 
-def _view(pose: PoseSpec, stack: Stack, board: Board, warnings: list[str]) -> BoardView:
-    """One pose: the board in the camera's image, the phase at its features."""
+def _view(pose: PoseSpec, stack: Stack, board: Board) -> tuple[BoardView, list[str]]:
+    """One pose: the board in the camera's image, the phase at its features; and what is not good about it."""
     saturated = float(np.mean(np.asarray(stack.columns.reason) == 2))
     try:
         seen = find_board(stack.white, board)
@@ -263,6 +266,7 @@ def _view(pose: PoseSpec, stack: Stack, board: Board, warnings: list[str]) -> Bo
             f"the board is in view, but {int(with_phase.sum())} of its {len(points)} features have a phase along both "
             f"axes (pixels: {reasons})"
         )
+    warnings: list[str] = []
     if around > SATURATED_SHARE:
         warnings.append(f"{pose.name}: {around:.0%} of the board is saturated: expose less")
     if seen.edge_px > BLURRED_PX:
@@ -279,7 +283,8 @@ def _view(pose: PoseSpec, stack: Stack, board: Board, warnings: list[str]) -> Bo
         diameter = board.second_mm or seen.diameter_px / scale
     spread = phases.sigma_px.copy()
     spread[~with_phase] = np.nan
-    return BoardView(pose.name, points, seen.pixels, phases.projector_px, phases.slope, spread, seen.edge_px, diameter)
+    view = BoardView(pose.name, points, seen.pixels, phases.projector_px, phases.slope, spread, seen.edge_px, diameter)
+    return view, warnings
 
 
 def _other_size(stack: Stack, board: Board) -> tuple[int, int] | None:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from weldscan import terminal
-from weldscan._weldcore import __version__
+from weldscan._weldcore import __version__, set_threads
 from weldscan.calibration.cli import register as register_calibrations
 from weldscan.errors import InputError, NotMeasured, WeldscanError
 from weldscan.result import Severity, Verdict
@@ -84,6 +84,8 @@ def _options(
     ] = False,
 ) -> None:
     """Measures the edge displacement (hi-lo) of butt welds from structured-light scans, with U and a verdict."""
+    # A number of threads that is none is said before anything is read.
+    set_threads()
 
 
 @app.command(

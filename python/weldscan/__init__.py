@@ -9,6 +9,7 @@ from weldscan._weldcore import (
     Cloud,
     Cylinder,
     CylinderFit,
+    Disagreement,
     Follower,
     FoundSphere,
     KdTree,
@@ -71,6 +72,7 @@ from weldscan.pose import (
 )
 
 if TYPE_CHECKING:
+    from weldscan.calibration.artefact import PlateView, find_plate
     from weldscan.calibration.hand_eye import solve_hand_eye
     from weldscan.calibration.response import compensate_phase, estimate_response, response_of_folder
     from weldscan.calibration.scanner import BoardView, calibrate_scanner, solve_scanner
@@ -81,7 +83,16 @@ if TYPE_CHECKING:
     from weldscan.report.validation import write_validation
     from weldscan.report.verification import write_verification
     from weldscan.response import FringeResponse, Response, read_response, response_of_ramp, write_response
-    from weldscan.result import Inspection, Label, ScannerCalibration, Standing, Validation, Verdict, Verification
+    from weldscan.result import (
+        HandEye,
+        Inspection,
+        Label,
+        ScannerCalibration,
+        Standing,
+        Validation,
+        Verdict,
+        Verification,
+    )
     from weldscan.session import (
         Session,
         iter_frames,
@@ -97,6 +108,7 @@ if TYPE_CHECKING:
 
 # The faces are imported when they are asked for: they bring pydantic and OpenCV, which an algorithm does not need.
 _LAZY = {
+    "weldscan.calibration.artefact": ("PlateView", "find_plate"),
     "weldscan.calibration.hand_eye": ("solve_hand_eye",),
     "weldscan.calibration.response": ("compensate_phase", "estimate_response", "response_of_folder"),
     "weldscan.calibration.scanner": ("BoardView", "calibrate_scanner", "solve_scanner"),
@@ -108,6 +120,7 @@ _LAZY = {
     "weldscan.report.verification": ("write_verification",),
     "weldscan.response": ("FringeResponse", "Response", "read_response", "response_of_ramp", "write_response"),
     "weldscan.result": (
+        "HandEye",
         "Inspection",
         "Label",
         "ScannerCalibration",
@@ -146,10 +159,12 @@ __all__ = [
     "CylinderFit",
     "DeviceError",
     "DeviceTimeout",
+    "Disagreement",
     "Follower",
     "FoundSphere",
     "FringeResponse",
     "GeometryError",
+    "HandEye",
     "InputError",
     "Inspection",
     "KdTree",
@@ -162,6 +177,7 @@ __all__ = [
     "PhaseMap",
     "Plane",
     "PlaneFit",
+    "PlateView",
     "ReferencePlane",
     "Registration",
     "Response",
@@ -194,6 +210,7 @@ __all__ = [
     "estimate_normals",
     "estimate_phase_error",
     "estimate_response",
+    "find_plate",
     "find_spheres",
     "fit_cylinder",
     "fit_plane",

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from weldscan._weldcore import phase_error_of_harmonics
+from weldscan._weldcore import phase_error_of_harmonics, refuse_masked
 from weldscan.errors import GeometryError, InputError
 from weldscan.session import explain, read_text
 
@@ -184,6 +184,8 @@ def response_of_ramp(level: ArrayLike, light: ArrayLike, *, noise: float = 0.0) 
         >>> round(response_of_ramp(level, [10 + 180 * (v / 255) ** 2.2 for v in level]).gamma, 2)
         2.2
     """
+    refuse_masked("level", level)
+    refuse_masked("light", light)
     levels, lights = np.asarray(level, np.float64), np.asarray(light, np.float64)
     if levels.ndim != 1 or levels.shape != lights.shape:
         raise InputError(f"ramp: {levels.shape} levels for {lights.shape} lights")

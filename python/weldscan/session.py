@@ -36,7 +36,7 @@ from pydantic import (
     model_validator,
 )
 
-from weldscan._weldcore import Lens, Scanner, decode_png
+from weldscan._weldcore import Lens, Scanner, decode_png, refuse_masked
 from weldscan.errors import InputError
 from weldscan.result import HandEye, ScannerCalibration
 
@@ -916,6 +916,7 @@ def write_session(
 
 
 def _write_image(path: Path, image: Image, size: tuple[int, int]) -> None:
+    refuse_masked("frames", image)
     if image.shape != size or image.dtype not in (np.uint8, np.uint16):
         raise InputError(
             f"frames: {path.parent.name}/{path.name} is {image.shape} {image.dtype}, not {size} uint8 or uint16"

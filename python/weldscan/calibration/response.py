@@ -21,6 +21,7 @@ from weldscan._weldcore import (
     estimate_phase_error,
     harmonics_of_gamma,
     phase_error_of_harmonics,
+    refuse_masked,
 )
 from weldscan.errors import GeometryError, InputError
 from weldscan.response import FringeResponse, Response, gamma_of_second_harmonic, measured, response_of_ramp
@@ -74,6 +75,8 @@ def estimate_response(
         >>> round(response.gamma, 1)
         1.5
     """
+    refuse_masked("images", images)
+    refuse_masked("mask", mask)
     frames = [np.asarray(image) for image in images]
     needed = sum(steps for _, steps in fringes)
     if not fringes or len(frames) != needed:
@@ -217,6 +220,8 @@ def compensate_phase(
         >>> bool(np.abs(np.angle(np.exp(1j * (found - true)))).max() < 0.01)
         True
     """
+    refuse_masked("wrapped", wrapped)
+    refuse_masked("mask", mask)
     phases = np.asarray(wrapped, dtype=np.float64)
     if phases.ndim == 3:
         many = [steps] * len(phases) if isinstance(steps, int) else list(steps)

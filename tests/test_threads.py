@@ -218,7 +218,14 @@ MEMORY = """
     print(*ends)
 """
 
-SCALES = {"KdTree.radius": 20.0, "simulate_shot": 3.0, "distance": 30.0, "find_spheres": 20.0, "fit_plane": 40.0}
+SCALES = {
+    "KdTree.knn": 30.0,
+    "KdTree.radius": 20.0,
+    "simulate_shot": 3.0,
+    "distance": 30.0,
+    "find_spheres": 20.0,
+    "fit_plane": 40.0,
+}
 """Where the catalogue's work times 10 is too small or too long."""
 
 

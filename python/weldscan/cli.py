@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from weldscan import boundary, terminal
-from weldscan._weldcore import __version__
+from weldscan._weldcore import __version__, set_threads
 from weldscan.calibration.cli import register as register_calibrations
 from weldscan.errors import InputError
 from weldscan.station.cli import register as register_cell
@@ -81,6 +81,8 @@ def _options(
     ] = False,
 ) -> None:
     """Measures the edge displacement (hi-lo) of butt welds from structured-light scans, with U and a verdict."""
+    # A number of threads that is none is said before anything is read.
+    set_threads()
 
 
 @app.command(

@@ -39,7 +39,7 @@ demo: build ## a simulated cell, measured: summary and report
 
 test: build $(VENV)/.peers ## every test, Rust and Python
 	cargo test --locked --workspace
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 check: build ## format, lints, types, import contracts, documentation
 	cargo fmt --all --check

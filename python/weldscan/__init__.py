@@ -8,6 +8,7 @@ if TYPE_CHECKING:
         Cloud,
         Cylinder,
         CylinderFit,
+        Disagreement,
         Follower,
         FoundSphere,
         KdTree,
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
         unwrap_spatial,
         unwrap_temporal,
     )
+    from weldscan.calibration.artefact import PlateView, find_plate
     from weldscan.calibration.hand_eye import solve_hand_eye
     from weldscan.calibration.response import compensate_phase, estimate_response, response_of_folder, response_of_ramp
     from weldscan.calibration.scanner import BoardView, calibrate_scanner, solve_scanner
@@ -84,13 +86,23 @@ if TYPE_CHECKING:
     from weldscan.report import write_report
     from weldscan.report.validation import write_validation
     from weldscan.report.verification import write_verification
-    from weldscan.result import Inspection, Label, ScannerCalibration, Standing, Validation, Verdict, Verification
+    from weldscan.result import (
+        HandEye,
+        Inspection,
+        Label,
+        ScannerCalibration,
+        Standing,
+        Validation,
+        Verdict,
+        Verification,
+    )
     from weldscan.verification import VerificationLimits, flatness_error, probing_error, read_limits, verify
     from weldscan.verification.validation import validate
 
 # Names are imported when they are asked for: a command is to stand behind its error boundary before anything heavy is
 # loaded, and an algorithm needs neither pydantic nor OpenCV. What is in none of these is the core's.
 _LAZY = {
+    "weldscan.calibration.artefact": ("PlateView", "find_plate"),
     "weldscan.calibration.hand_eye": ("solve_hand_eye",),
     "weldscan.calibration.response": (
         "compensate_phase",
@@ -124,6 +136,7 @@ _LAZY = {
     "weldscan.report.validation": ("write_validation",),
     "weldscan.report.verification": ("write_verification",),
     "weldscan.result": (
+        "HandEye",
         "Inspection",
         "Label",
         "ScannerCalibration",
@@ -164,10 +177,12 @@ __all__ = [
     "CylinderFit",
     "DeviceError",
     "DeviceTimeout",
+    "Disagreement",
     "Follower",
     "FoundSphere",
     "FringeResponse",
     "GeometryError",
+    "HandEye",
     "InputError",
     "Inspection",
     "KdTree",
@@ -180,6 +195,7 @@ __all__ = [
     "PhaseMap",
     "Plane",
     "PlaneFit",
+    "PlateView",
     "ReferencePlane",
     "Registration",
     "Response",
@@ -212,6 +228,7 @@ __all__ = [
     "estimate_normals",
     "estimate_phase_error",
     "estimate_response",
+    "find_plate",
     "find_spheres",
     "fit_cylinder",
     "fit_plane",

@@ -48,6 +48,7 @@ __all__ = [
     "measure_step",
     "phase_error_of_harmonics",
     "place_shots",
+    "refuse_masked",
     "register_icp",
     "register_rigid",
     "saturation_level",
@@ -66,6 +67,7 @@ __version__: str
 
 def decode_png(data: bytes, size: tuple[int, int] | None = None) -> NDArray[np.uint8] | NDArray[np.uint16]: ...
 def set_threads(threads: int | None = None) -> None: ...
+def refuse_masked(what: str, given: object) -> None: ...
 
 # scanner
 @final
@@ -286,7 +288,7 @@ def simulate_shot(
     fringes: Sequence[tuple[str, float, int] | tuple[str, float, int, float, float]],
     photometry: Any,
     *,
-    exposures: Sequence[float] = ...,
+    exposures: Sequence[float] | None = None,
     seed: int = 0,
 ) -> SimulatedShot: ...
 def simulated_step(weld: Any, along: ArrayLike) -> NDArray[np.float64]: ...

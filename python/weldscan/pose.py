@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from weldscan._weldcore import refuse_masked
 from weldscan.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -66,6 +67,7 @@ def kuka_from_matrix(matrix: ArrayLike) -> tuple[float, float, float, float, flo
     >>> kuka_from_matrix(matrix_from_kuka(1, 2, 3, 40, 90, 30))[3:]
     (0.0, 90.0, -10.0)
     """
+    refuse_masked("pose", matrix)
     m = np.asarray(matrix, dtype=np.float64)
     if m.shape != (4, 4) or not np.isfinite(m).all():
         raise InputError(f"pose: a 4x4 matrix of finite numbers is needed, not one of shape {m.shape}")

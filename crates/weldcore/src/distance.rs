@@ -9,7 +9,9 @@ use rayon::prelude::*;
 use crate::Vec3;
 use crate::error::{Error, Result, require_finite, require_positive};
 use crate::kdtree::{self, KdTree};
+use crate::memory::require;
 use crate::mesh::Mesh;
+use crate::stop::polled;
 use crate::threads;
 
 /// Points handed to a thread at a time.
@@ -40,10 +42,12 @@ pub fn distance(points: &[[f64; 3]], target: &Target, signed: bool) -> Result<Ve
         Target::Mesh(mesh) => mesh.distance(points, signed),
         Target::Surface(surface) => {
             require_finite("points", points)?;
+            require(points.len(), 8);
             let mut distance = vec![0.0; points.len()];
             threads::install(|| {
                 (points.par_chunks(CHUNK), distance.par_chunks_mut(CHUNK))
                     .into_par_iter()
+                    .inspect(polled)
                     .for_each(|(points, distance)| to_surface(surface, signed, points, distance));
             });
             Ok(distance)
@@ -101,23 +105,23 @@ fn each(points: &[[f64; 3]], distance: &mut [f64], signed: bool, formula: impl F
 /// All points `p` with `normal · (p - point) = 0`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Plane {
-    point: Vec3,
-    normal: Vec3,
+    pub(crate) point: Vec3,
+    pub(crate) normal: Vec3,
 }
 
 /// All points at a distance from the centre.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sphere {
-    center: Vec3,
-    radius: f64,
+    pub(crate) center: Vec3,
+    pub(crate) radius: f64,
 }
 
 /// All points at a distance from the axis: a cylinder without ends.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Cylinder {
-    point: Vec3,
-    axis: Vec3,
-    radius: f64,
+    pub(crate) point: Vec3,
+    pub(crate) axis: Vec3,
+    pub(crate) radius: f64,
 }
 
 /// A surface with a formula: distances to it are exact.

@@ -19,7 +19,9 @@ use crate::Vec3;
 use crate::distance::{Surface, Target};
 use crate::error::{Error, Result, require_count, require_finite, require_positive};
 use crate::kdtree::{Aside, KdTree, Step, order_along};
+use crate::memory::require;
 use crate::mesh::Mesh;
+use crate::stop::polled;
 use crate::threads;
 use crate::transform::Transform;
 
@@ -258,6 +260,7 @@ struct Rounds<'a> {
 
 impl<'a> Rounds<'a> {
     fn new(all: &[[f64; 3]], wanted: usize, target: &'a Target<'a>, options: &'a Options) -> Self {
+        require(wanted.min(all.len()), 280);
         let mut chosen = spread(all.len(), wanted);
         let mut source: Vec<[f64; 3]> = chosen.iter().filter_map(|&i| all.get(i as usize).copied()).collect();
         if let Some(order) = threads::install(|| order_along(&source)) {
@@ -309,6 +312,7 @@ impl<'a> Rounds<'a> {
         threads::install(|| {
             (self.source.par_chunks(CHUNK), self.steps.par_chunks_mut(CHUNK), self.matches.par_chunks_mut(CHUNK))
                 .into_par_iter()
+                .inspect(polled)
                 .for_each(|(source, steps, matches)| match target {
                     Target::Cloud(tree, normals) => {
                         let normals = normals.filter(|_| metric == Metric::Plane);
@@ -369,6 +373,7 @@ impl<'a> Rounds<'a> {
         let parts: Vec<Equations> = threads::install(|| {
             (self.source.par_chunks(CHUNK), self.matches.par_chunks(CHUNK))
                 .into_par_iter()
+                .inspect(polled)
                 .map(|(source, matches)| accumulate(&setting, source, matches))
                 .collect()
         });

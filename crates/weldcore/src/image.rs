@@ -77,6 +77,7 @@ pub fn decode_png(data: &[u8], size: Option<[usize; 2]>) -> Result<GreyImage> {
         .output_buffer_size()
         .filter(|_| width.checked_mul(height).is_some_and(|n| n <= MAX_PIXELS))
         .ok_or_else(|| wrong(format!("is {width}x{height} pixels: too many")))?;
+    crate::memory::require(bytes, 2);
     let mut buffer = vec![0; bytes];
     reader.next_frame(&mut buffer).map_err(failed)?;
     reader.finish().map_err(failed)?;

@@ -9,7 +9,7 @@
 //! - **Precision**: geometry is `f64` and is centred before any solve; modulation, background and sigma are `f32`.
 //! - **Determinism**: the same input gives the same bits on any number of threads. Work is cut into chunks of fixed
 //!   size, partial sums are added in chunk order, ties go to the lowest index (see [`threads`]).
-//! - **Errors**: one enum, [`Error`]. Nothing here panics on any input.
+//! - **Errors**: one enum, [`Error`]. Nothing here panics on any input; a call may be ended by unwinding (see [`stop`]).
 //!
 //! # Rooms
 //! | module | what is in it |
@@ -30,6 +30,8 @@
 //! | [`sections`] | cap, toes, the surfaces beside them and the undisturbed walls, station by station |
 //! | [`place`] | the shots of a part joined into one cloud in base |
 //! | [`step`] | the step around the seam and its uncertainty |
+//! | [`threads`] | the pools of threads, and loops whose bits do not depend on them |
+//! | [`stop`] | ending a long call on request, or for want of memory |
 //! | [`memory`] | large results without the cost of fresh memory |
 //! | [`image`] | grey PNG files, read strictly |
 //! | [`simulate`] | ray-cast fringe images of analytic scenes |
@@ -52,6 +54,7 @@ pub mod segment;
 pub mod simulate;
 mod statistics;
 pub mod step;
+pub mod stop;
 pub mod threads;
 pub mod transform;
 pub mod triangulate;

@@ -3,16 +3,148 @@
 //! The system hands out fresh memory page by page and clears each page at its first touch: for the 26 MB that decoding one
 //! shot returns, that takes longer than computing what goes into them. [`Recycler`] keeps large blocks that were given
 //! back for the next large result, and asks for huge pages where the system offers them on request.
+//!
+//! Where the system has no memory left, a call ends (see [`stop`](crate::stop)), not the process: what needs much of it
+//! asks by [`require`] whether it is to be had before it begins; for the rest there is a cushion, which is given up when
+//! the system refuses, so that a call gets to its next [`poll`](crate::stop::poll) and ends there.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::mem::MaybeUninit;
+use std::ptr::null_mut;
 use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, AtomicPtr, Ordering};
+
+use crate::stop::{Stopped, poll, stop};
 
 /// From this size on blocks are kept, and huge pages asked for: below, there is little to gain.
 const LARGE_BYTES: usize = 1 << 20;
 /// What is kept at most: the results of a shot of a few megapixels.
 const KEPT_BYTES: usize = 160 << 20;
 const KEPT_BLOCKS: usize = 48;
+/// Alignment of large blocks.
+const ALIGNED: usize = 16;
+
+/// What a call may need without asking. It is address space alone: nobody touches it.
+const CUSHION_BYTES: usize = 32 << 20;
+
+static CUSHION: AtomicPtr<u8> = AtomicPtr::new(null_mut());
+/// Whether the cushion was given up in want of memory.
+static SHORT: AtomicBool = AtomicBool::new(false);
+
+fn cushion() -> Layout {
+    Layout::new::<[u8; CUSHION_BYTES]>()
+}
+
+/// Whether the system had no memory to give since the last call began.
+#[inline]
+pub(crate) fn is_short() -> bool {
+    SHORT.load(Ordering::Relaxed)
+}
+
+/// Sees to the cushion before a call.
+///
+/// # Errors
+/// There is no memory for it.
+pub(crate) fn prepare() -> Result<(), Stopped> {
+    if CUSHION.load(Ordering::Relaxed).is_null() {
+        // SAFETY: the layout is not empty.
+        let fresh = asked(CUSHION_BYTES + 1, || unsafe { System.alloc(cushion()) });
+        if fresh.is_null() {
+            return Err(Stopped::OutOfMemory);
+        }
+        if CUSHION.compare_exchange(null_mut(), fresh, Ordering::AcqRel, Ordering::Acquire).is_err() {
+            // SAFETY: another thread's is in place; this one was shown to nobody.
+            unsafe { System.dealloc(fresh, cushion()) };
+        }
+    }
+    SHORT.store(false, Ordering::Relaxed);
+    Ok(())
+}
+
+/// Ends the call where the system has not the memory for `count` items of `bytes` each, all in all.
+pub(crate) fn require(count: usize, bytes: usize) {
+    poll();
+    match count.checked_mul(bytes) {
+        Some(small) if small < CUSHION_BYTES => {}
+        Some(size) if is_to_be_had(size) => {}
+        _ => stop(Stopped::OutOfMemory),
+    }
+}
+
+/// Ends the call where the system has not the address space to start `count` threads in: a thread that gets its stack and
+/// nothing more takes the process with it.
+#[cfg(target_os = "linux")]
+pub(crate) fn require_threads(count: usize) {
+    use std::ffi::{c_int, c_long, c_void};
+    unsafe extern "C" {
+        fn mmap(start: *mut c_void, size: usize, access: c_int, kind: c_int, file: c_int, at: c_long) -> *mut c_void;
+        fn munmap(start: *mut c_void, size: usize) -> c_int;
+    }
+    /// Its stack, and room for what it starts with.
+    const THREAD_BYTES: usize = 3 << 20;
+    const NO_ACCESS: c_int = 0;
+    const PRIVATE_AND_ANONYMOUS: c_int = 0x22;
+    let size = count * THREAD_BYTES;
+    // SAFETY: fresh pages, which nobody sees before they go back.
+    let start = asked(size, || match unsafe { mmap(null_mut(), size, NO_ACCESS, PRIVATE_AND_ANONYMOUS, -1, 0) } {
+        refused if refused.addr() == usize::MAX => null_mut(),
+        start => start.cast(),
+    });
+    if start.is_null() {
+        stop(Stopped::OutOfMemory);
+    }
+    // SAFETY: as above.
+    unsafe { munmap(start.cast(), size) };
+}
+
+#[cfg(not(target_os = "linux"))]
+pub(crate) fn require_threads(_: usize) {}
+
+/// Whether the system has a block of some bytes, more than none, to give.
+fn is_to_be_had(size: usize) -> bool {
+    let Ok(wanted) = Layout::from_size_align(size, ALIGNED) else { return false };
+    // SAFETY: the layout is not empty, and the block goes back as it came.
+    unsafe {
+        let start = asked(size, || System.alloc(wanted));
+        if !start.is_null() {
+            System.dealloc(start, wanted);
+        }
+        !start.is_null()
+    }
+}
+
+/// A block as `ask` gets it from the system; where the system has none, again after giving back what is kept, and at last
+/// the cushion. Null where all that is not enough.
+fn asked(size: usize, ask: impl Fn() -> *mut u8) -> *mut u8 {
+    let mut start = ask();
+    if start.is_null() && give_back_kept() {
+        start = ask();
+    }
+    if start.is_null() && size <= CUSHION_BYTES {
+        let given_up = CUSHION.swap(null_mut(), Ordering::AcqRel);
+        if !given_up.is_null() {
+            SHORT.store(true, Ordering::Relaxed);
+            // SAFETY: it came with this layout, and is nobody's any more.
+            unsafe { System.dealloc(given_up, cushion()) };
+            start = ask();
+        }
+    }
+    start
+}
+
+/// Gives the blocks that are kept back to the system, and tells whether there were any.
+fn give_back_kept() -> bool {
+    let Ok(mut kept) = KEPT.try_lock() else { return false };
+    let count = std::mem::take(&mut kept.count);
+    kept.bytes = 0;
+    for &(address, size) in kept.blocks.iter().take(count) {
+        if let Ok(layout) = Layout::from_size_align(size, ALIGNED) {
+            // SAFETY: it came from the system with this layout, and is off the list.
+            unsafe { System.dealloc(std::ptr::with_exposed_provenance_mut(address), layout) };
+        }
+    }
+    count > 0
+}
 
 /// The allocator of the Python module: the system's, but for large blocks, of which up to 160 MB are kept when they are
 /// freed and handed out again. A Rust program may choose it, too, by `#[global_allocator]`.
@@ -54,7 +186,6 @@ impl Kept {
 /// The layout that a large block really has: rounded up by at most an eighth, so that results of nearly the same size
 /// share blocks. `None` for what the system serves alone.
 fn large(layout: Layout) -> Option<Layout> {
-    const ALIGNED: usize = 16;
     if layout.size() < LARGE_BYTES || layout.align() > ALIGNED {
         return None;
     }
@@ -71,18 +202,26 @@ fn recycled(block: Layout) -> Option<*mut u8> {
 // with the same; a kept block is in the list once, and is out of it before it is handed out.
 unsafe impl GlobalAlloc for Recycler {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        let Some(block) = large(layout) else { return unsafe { System.alloc(layout) } };
-        recycled(block).unwrap_or_else(|| request_huge_pages(unsafe { System.alloc(block) }, block.size()))
+        let Some(block) = large(layout) else { return asked(layout.size(), || unsafe { System.alloc(layout) }) };
+        recycled(block).unwrap_or_else(|| {
+            let fresh = asked(block.size(), || unsafe { System.alloc(block) });
+            request_huge_pages(fresh, block.size())
+        })
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
-        let Some(block) = large(layout) else { return unsafe { System.alloc_zeroed(layout) } };
+        let Some(block) = large(layout) else {
+            return asked(layout.size(), || unsafe { System.alloc_zeroed(layout) });
+        };
         match recycled(block) {
             Some(start) => {
                 unsafe { start.write_bytes(0, layout.size()) };
                 start
             }
-            None => request_huge_pages(unsafe { System.alloc_zeroed(block) }, block.size()),
+            None => {
+                let fresh = asked(block.size(), || unsafe { System.alloc_zeroed(block) });
+                request_huge_pages(fresh, block.size())
+            }
         }
     }
 
@@ -97,10 +236,10 @@ unsafe impl GlobalAlloc for Recycler {
     unsafe fn realloc(&self, start: *mut u8, layout: Layout, size: usize) -> *mut u8 {
         let Ok(wanted) = Layout::from_size_align(size, layout.align()) else { return std::ptr::null_mut() };
         match (large(layout), large(wanted)) {
-            (None, None) => unsafe { System.realloc(start, layout, size) },
+            (None, None) => asked(size, || unsafe { System.realloc(start, layout, size) }),
             (Some(old), Some(new)) if old == new => start,
             // Large blocks grow by moving their pages, not their bytes.
-            (Some(old), Some(new)) => unsafe { System.realloc(start, old, new.size()) },
+            (Some(old), Some(new)) => asked(new.size(), || unsafe { System.realloc(start, old, new.size()) }),
             _ => unsafe {
                 let moved = self.alloc(wanted);
                 if !moved.is_null() {
@@ -137,6 +276,7 @@ fn request_huge_pages(start: *mut u8, _: usize) -> *mut u8 {
 
 /// Room for `n` values that are all going to be written: clearing it first would take as long as writing it.
 pub(crate) fn room<T: Copy>(n: usize) -> Vec<MaybeUninit<T>> {
+    require(n, size_of::<T>());
     let mut values = Vec::with_capacity(n);
     // SAFETY: the capacity is there, and values that may be uninitialised need no initialising.
     unsafe { values.set_len(n) };

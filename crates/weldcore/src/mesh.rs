@@ -16,6 +16,8 @@ use crate::Vec3;
 use crate::distance::Foot;
 use crate::error::{Error, Result, require_count, require_finite};
 use crate::kdtree::{Aside, BoxTree, Extent, Item, Visit, WIDTH, at_most, for_chunks, max, min, order};
+use crate::memory::require;
+use crate::stop::{poll, polled};
 use crate::threads;
 
 /// Coordinates beyond this would overflow in the products of a projection.
@@ -72,12 +74,17 @@ impl Mesh {
         if !triangles.iter().any(|t| Triangle::new(at(t[0]), at(t[1]), at(t[2])).normal().is_some()) {
             return Err(no_area());
         }
+        require(vertices.len() + triangles.len(), 800);
         let points = vertices.iter().map(|&v| Vector::from_array(v)).collect();
-        let mut mesh = TriMesh::new(points, triangles.to_vec()).map_err(|_| no_area())?;
-        // One after the other: merging first, so that the others see the merged vertices.
-        let _ = mesh.set_flags(TriMeshFlags::DELETE_DEGENERATE_TRIANGLES | TriMeshFlags::MERGE_DUPLICATE_VERTICES);
-        let topology = mesh.set_flags(mesh.flags() | TriMeshFlags::HALF_EDGE_TOPOLOGY | TriMeshFlags::ORIENTED);
-        let unoriented = topology.err().map(|_| "two triangles run along an edge in the same direction".to_string());
+        let given = triangles.to_vec();
+        let (mesh, unoriented) = threads::left_to_itself(move || {
+            let mut mesh = TriMesh::new(points, given).ok()?;
+            // One after the other: merging first, so that the others see the merged vertices.
+            let _ = mesh.set_flags(TriMeshFlags::DELETE_DEGENERATE_TRIANGLES | TriMeshFlags::MERGE_DUPLICATE_VERTICES);
+            let topology = mesh.set_flags(mesh.flags() | TriMeshFlags::HALF_EDGE_TOPOLOGY | TriMeshFlags::ORIENTED);
+            Some((mesh, topology.err().map(|_| "two triangles run along an edge in the same direction".to_string())))
+        })
+        .ok_or_else(no_area)?;
         Self::from_parry(&mesh, vertices.len(), triangles.len(), unoriented).ok_or_else(no_area)
     }
 
@@ -98,6 +105,7 @@ impl Mesh {
         }
         let mut faces = Vec::with_capacity(mesh.indices().len());
         for (t, corners) in mesh.indices().iter().enumerate() {
+            poll();
             let triangle = mesh.triangle(t as u32);
             let Some(normal) = triangle.normal() else { continue };
             let edge = |k: usize| {
@@ -123,7 +131,7 @@ impl Mesh {
                 .collect();
             order(&mut items);
             let faces: Vec<Face> = items.iter().map(|i| faces[i.index as usize].clone()).collect();
-            let leaves: Vec<Leaf> = faces.par_chunks(WIDTH).map(Leaf::new).collect();
+            let leaves: Vec<Leaf> = faces.par_chunks(WIDTH).inspect(polled).map(Leaf::new).collect();
             let eights: Vec<&[Face]> = faces.chunks(WIDTH).collect();
             (BoxTree::new(&eights, |eight| around(eight)), leaves, faces)
         });
@@ -171,6 +179,7 @@ impl Mesh {
     /// # Errors
     /// [`Error::NonFinite`], [`Error::OutOfRange`] as in [`Mesh::new`]; with `signed` those of [`Mesh::require_sides`].
     pub fn feet(&self, points: &[[f64; 3]], signed: bool) -> Result<Vec<Foot>> {
+        require(points.len(), size_of::<Foot>());
         let mut feet = vec![Foot { distance: 0.0, point: Vec3::zeros(), normal: Vec3::zeros() }; points.len()];
         self.each_foot(points, signed, &mut feet, |to, foot| *to = foot)?;
         Ok(feet)
@@ -199,6 +208,7 @@ impl Mesh {
         put: impl Fn(&mut T, Foot) + Sync,
     ) -> Result<()> {
         require_range("points", points)?;
+        require(points.len(), 48 + 2 * size_of::<T>());
         if signed {
             self.require_sides()?;
         }
@@ -355,6 +365,7 @@ fn plain_feet_of<T>(
 ) {
     let mut aside = Aside::new();
     for (p, out) in points.iter().zip(out) {
+        poll();
         let mut found = NearestFace { leaves: &mesh.leaves, q: *p, squared: f64::MAX, face: 0 };
         found.visit(mesh.boxes.dive(p));
         mesh.boxes.search(p, &mut aside, &mut found);

@@ -7,7 +7,8 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result, require_count};
 use crate::kdtree::{Aside, KdTree, Nearby};
-use crate::memory::{filled, room};
+use crate::memory::{filled, require, room};
+use crate::stop::{poll, polled};
 use crate::threads;
 
 /// Rows of the grid handed to a thread at a time.
@@ -44,7 +45,7 @@ pub fn of_grid(points: &[[f64; 3]], width: usize, window: usize, viewpoint: [f64
     let mut normals = room::<[f64; 3]>(points.len());
     let jump = JUMP * common_distance(points, width);
     threads::install(|| {
-        normals.par_chunks_mut(ROWS * width).enumerate().for_each(|(strip, normals)| {
+        normals.par_chunks_mut(ROWS * width).inspect(polled).enumerate().for_each(|(strip, normals)| {
             of_strip(&Grid { points, width, reach: window / 2, jump, viewpoint }, strip * ROWS, normals);
         });
     });
@@ -60,7 +61,8 @@ fn common_distance(points: &[[f64; 3]], width: usize) -> f64 {
     };
     let distances =
         |row: &[[f64; 3]]| -> Vec<f64> { row.windows(2).step_by(3).map(squared).filter(|d| d.is_finite()).collect() };
-    let rows: Vec<Vec<f64>> = threads::install(|| points.par_chunks(width).step_by(3).map(distances).collect());
+    let rows: Vec<Vec<f64>> =
+        threads::install(|| points.par_chunks(width).step_by(3).inspect(polled).map(distances).collect());
     let mut all: Vec<f64> = rows.into_iter().flatten().collect();
     if all.is_empty() {
         return 0.0;
@@ -346,10 +348,12 @@ pub fn of_tree(tree: &KdTree, k: usize, viewpoint: [f64; 3]) -> Result<Vec<[f64;
         return Err(Error::OutOfRange { what: "k", expected: "at least 3".into(), value: k.to_string() });
     }
     require_count("points", k, tree.len())?;
+    require(tree.len(), 100);
     let places: Vec<usize> = (0..tree.places()).step_by(PLACES).collect();
     let parts: Vec<Vec<(u32, [f64; 3])>> = threads::install(|| {
         places
             .par_iter()
+            .inspect(polled)
             .map(|&first| of_places(tree, first, (first + PLACES).min(tree.places()), k, viewpoint))
             .collect()
     });
@@ -372,6 +376,7 @@ fn of_places(tree: &KdTree, first: usize, last: usize, k: usize, viewpoint: [f64
         if index as usize >= tree.len() {
             continue;
         }
+        poll();
         tree.nearby(&p, &mut aside, &mut nearby);
         // Relative to the point itself: no cancellation far from the origin.
         let (mut sum, mut squares) = ([0.0; 3], [0.0; 6]);

@@ -3,7 +3,9 @@
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
+use crate::memory::require;
 use crate::segment::Unrolled;
+use crate::stop::polled;
 use crate::threads::{self, CHUNK};
 use crate::transform::Transform;
 
@@ -61,13 +63,17 @@ pub fn place(scans: &[Scan]) -> Result<Placed> {
             return Err(Error::Shape { what: "scan", expected: format!("{n} of each"), got: format!("{lengths:?}") });
         }
     }
+    require(scans.iter().map(|s| s.points.len()).sum(), 40);
     let chunks: Vec<(&Scan, usize)> =
         scans.iter().flat_map(|s| (0..s.points.len()).step_by(CHUNK).map(move |start| (s, start))).collect();
     let indices = |s: &Scan, start: usize| start..(start + CHUNK).min(s.points.len());
     let kept = |s: &Scan, i: usize| s.deviation_mm[i].is_finite();
     threads::install(|| {
-        let counts: Vec<usize> =
-            chunks.par_iter().map(|&(s, start)| indices(s, start).filter(|&i| kept(s, i)).count()).collect();
+        let counts: Vec<usize> = chunks
+            .par_iter()
+            .inspect(polled)
+            .map(|&(s, start)| indices(s, start).filter(|&i| kept(s, i)).count())
+            .collect();
         let total = counts.iter().sum();
         let mut out = Placed {
             points: vec![0.0; 3 * total],
@@ -88,7 +94,7 @@ pub fn place(scans: &[Scan]) -> Result<Placed> {
                 (first, (take(&mut angles, n), take(&mut axials, n), take(&mut shots, n)))
             })
             .collect();
-        chunks.par_iter().zip(slots).for_each(
+        chunks.par_iter().inspect(polled).zip(slots).for_each(
             |(&(s, start), ((points, labels, deviations), (angles, axials, shots)))| {
                 for (slot, i) in indices(s, start).filter(|&i| kept(s, i)).enumerate() {
                     let p = s.base_from_scanner.apply(&s.points[i].into());

@@ -5,12 +5,14 @@
 //! `u = fx x' + cx`, `v = fy y' + cy`; the centre of the first pixel is (0, 0). A projector is a camera that is used
 //! backwards. The scanner's frame is its camera's.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use rayon::prelude::*;
 
 use crate::Vec3;
 use crate::error::{Error, Result, require_positive};
+use crate::memory::require;
+use crate::stop::polled;
 use crate::threads;
 use crate::transform::Transform;
 
@@ -141,6 +143,7 @@ impl Lens {
 
 fn pairs<T: Sync>(items: &[T], of: impl Fn(&T) -> Option<(f64, f64)> + Sync) -> Vec<[f64; 2]> {
     let pair = |item: &T| of(item).map_or([f64::NAN; 2], |(a, b)| [a, b]);
+    require(items.len(), 40);
     threads::map_chunks(items, |_, chunk| chunk.iter().map(pair).collect::<Vec<_>>()).concat()
 }
 
@@ -155,11 +158,12 @@ pub struct Rays {
 
 impl Rays {
     fn of(lens: &Lens) -> Self {
+        require(lens.width * lens.height, 40);
         let row = |v: usize| -> (Vec<f64>, Vec<f64>) {
             let direction = |u: usize| lens.undistort(u as f64, v as f64).unwrap_or((f64::NAN, f64::NAN));
             (0..lens.width).map(direction).unzip()
         };
-        let rows: Vec<_> = threads::install(|| (0..lens.height).into_par_iter().map(row).collect());
+        let rows: Vec<_> = threads::install(|| (0..lens.height).into_par_iter().inspect(polled).map(row).collect());
         let (x, y): (Vec<_>, Vec<_>) = rows.into_iter().unzip();
         Self { x: x.concat(), y: y.concat() }
     }
@@ -179,8 +183,10 @@ pub struct Scanner {
 
 impl Clone for Scanner {
     fn clone(&self) -> Self {
-        let rays = self.rays.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        Self { rays: Mutex::new(rays), ..Self::bare(self.camera, self.projector, self.camera_from_projector) }
+        Self {
+            rays: Mutex::new(self.kept_rays()),
+            ..Self::bare(self.camera, self.projector, self.camera_from_projector)
+        }
     }
 }
 
@@ -209,15 +215,21 @@ impl Scanner {
 
     /// The direction of every camera pixel; computed once and kept, for a scan asks for it with every shot.
     pub fn camera_rays(&self) -> Arc<Rays> {
-        let mut kept = self.rays.lock().unwrap_or_else(PoisonError::into_inner);
-        match kept.as_ref() {
-            Some((lens, rays)) if *lens == self.camera => rays.clone(),
+        match self.kept_rays() {
+            Some((lens, rays)) if lens == self.camera => rays,
             _ => {
                 let rays = Arc::new(Rays::of(&self.camera));
-                *kept = Some((self.camera, rays.clone()));
+                if let Ok(mut kept) = self.rays.try_lock() {
+                    *kept = Some((self.camera, rays.clone()));
+                }
                 rays
             }
         }
+    }
+
+    /// What is kept. A lock that another thread holds, perhaps one that a fork has cut off, is not waited for.
+    fn kept_rays(&self) -> Option<(Lens, Arc<Rays>)> {
+        self.rays.try_lock().ok()?.clone()
     }
 }
 

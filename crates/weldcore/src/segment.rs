@@ -201,6 +201,7 @@ pub fn segment(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<S
         let (expected, got) = (format!("rows of {width} pixels"), format!("{} pixels", points.len()));
         return Err(Error::Shape { what: "points", expected, got });
     }
+    crate::memory::require(points.len(), 80);
     let coarse = coarse_frame(points, width, nominal)?;
     let unrolled = Unrolled::of(points, &coarse);
     let thickness = nominal.wall_thickness_mm;
@@ -244,6 +245,7 @@ fn coarse_frame(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<
     let rows: Vec<usize> = (0..height).step_by(stride).collect();
     let found: Vec<Vec<(Vec3, Vec3)>> = threads::install(|| {
         rows.par_iter()
+            .inspect(crate::stop::polled)
             .map(|&r| {
                 let pick = |c| Some((Vec3::from(points[r * width + c]), normal(points, width, r, c, reach)?));
                 (0..width).step_by(stride).filter_map(pick).collect()

@@ -36,6 +36,7 @@ use crate::error::{Error, Result};
 use crate::sections::shell_term;
 use crate::segment::Label;
 use crate::statistics::median;
+use crate::stop::{poll, polled};
 use crate::threads;
 
 /// One shot, unrolled and labelled (see [`crate::segment`]).
@@ -431,6 +432,7 @@ impl Covariance {
         let parts: Vec<[[(f64, f64, f64); LAGS]; 2]> = threads::install(|| {
             indices
                 .par_chunks(64)
+                .inspect(polled)
                 .map(|chunk| {
                     let mut lags = [[(0.0, 0.0, 0.0); LAGS]; 2];
                     for &i in chunk {
@@ -523,6 +525,7 @@ impl Whitener {
     fn of(arcs: &[Arc], cells: &[Cell], covariance: &Covariance) -> Self {
         let mut rows: Vec<(usize, Vec<f64>)> = Vec::with_capacity(cells.len());
         for (i, cell) in cells.iter().enumerate() {
+            poll();
             let wall = cells[..i].iter().rev().take_while(|c| related(cell, c)).count();
             let near = |j: &usize| apart_mm(arcs, cell, &cells[*j])[0] < covariance.support_mm[0];
             let first = (i - wall..i).find(near).unwrap_or(i);
@@ -630,6 +633,7 @@ fn grid_of(index: usize, shot: &Shot, arc: &Arc) -> Result<Grid> {
     let parts: Vec<Vec<[f64; 4]>> = threads::install(|| {
         indices
             .par_chunks(8 * threads::CHUNK)
+            .inspect(polled)
             .map(|chunk| {
                 let mut sums = vec![[0.0; 4]; total];
                 for &i in chunk {
@@ -685,6 +689,7 @@ pub fn measure(shots: &[Shot], known: &Known) -> Result<Step> {
         crate::error::require_positive("radius_mm", shot.radius_mm)?;
         crate::error::require_positive("thickness_mm", shot.thickness_mm)?;
     }
+    crate::memory::require(shots.iter().map(|s| s.labels.len()).sum(), 24);
     let arcs = shots.iter().map(arc_of).collect::<Result<Vec<Arc>>>()?;
     let grids = (0..shots.len()).map(|k| grid_of(k, &shots[k], &arcs[k])).collect::<Result<Vec<Grid>>>()?;
     let cell_mm = grids.iter().map(|g| g.cell_mm).fold(0.0, f64::max);

@@ -16,8 +16,9 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
-use crate::memory::{fill, filled, room};
+use crate::memory::{fill, filled, require, room};
 use crate::scanner::{Lens, Rays, Scanner};
+use crate::stop::polled;
 use crate::threads::{self, CHUNK};
 
 /// Pixels that the kernel takes at a time.
@@ -253,17 +254,18 @@ pub fn triangulate(column_px: &[f64], scanner: &Scanner, sigma_px: Option<&[f32]
             return Err(Error::Shape { what, expected, got: got.to_string() });
         }
     }
+    require(n, 28);
     let problem = Problem::new(scanner, axis);
     let rays = scanner.camera_rays();
     let mut points_mm = room::<[f64; 3]>(n);
     let mut sigma_mm = room::<f32>(sigma_px.map_or(0, <[f32]>::len));
     threads::install(|| match sigma_px {
         Some(sigma_px) => {
-            let out = points_mm.par_chunks_mut(CHUNK).zip(sigma_mm.par_chunks_mut(CHUNK)).enumerate();
+            let out = points_mm.par_chunks_mut(CHUNK).inspect(polled).zip(sigma_mm.par_chunks_mut(CHUNK)).enumerate();
             out.for_each(|(i, (p, s))| chunk(&problem, &rays, column_px, sigma_px, i * CHUNK, p, s));
         }
         None => {
-            let out = points_mm.par_chunks_mut(CHUNK).enumerate();
+            let out = points_mm.par_chunks_mut(CHUNK).inspect(polled).enumerate();
             out.for_each(|(i, p)| chunk(&problem, &rays, column_px, &[], i * CHUNK, p, &mut []));
         }
     });
@@ -354,6 +356,7 @@ pub fn height_from_reference(phase: &[f64], reference: &[f64], geometry: &Refere
         let along = (reference - phase) * geometry.period_mm / std::f64::consts::TAU;
         geometry.distance_mm * along / (geometry.baseline_mm + along)
     };
+    require(phase.len(), 8);
     Ok(phase.iter().zip(reference).map(height).collect())
 }
 
@@ -369,6 +372,7 @@ pub fn height_from_calibration(phase: &[f64], reference: &[f64], plane: &Referen
         let along = reference - phase;
         along / (a * along + b)
     };
+    require(phase.len(), 8);
     Ok(phase.iter().zip(reference).zip(coefficients).map(height).collect())
 }
 
@@ -415,6 +419,7 @@ pub fn calibrate_reference_plane(reference: &[f64], phases: &[&[f64]], heights_m
         let square = dot(&|(p, q, h)| (p * a + q * b - h).powi(2));
         (a, b, (square / n as f64).sqrt() as f32)
     };
+    require(reference.len(), 72);
     let fits: Vec<_> = threads::install(|| (0..reference.len()).into_par_iter().with_min_len(CHUNK).map(fit).collect());
     let mut plane = ReferencePlane { a: Vec::new(), b: Vec::new(), rms_mm: Vec::new() };
     for (a, b, rms) in fits {

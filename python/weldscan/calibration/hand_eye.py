@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import register_rigid
+from weldscan._weldcore import refuse_masked, register_rigid
 from weldscan.calibration.artefact import (
     TOUCH_SIGMA_MM,
     PlateMismatch,
@@ -256,6 +256,9 @@ def _problem(
     views: Sequence[PlateView], base_from_flange: Sequence[Floats], touched_mm: Floats | None, noise: Noise
 ) -> _Problem:
     """The input, checked: shapes, finite, rigid, no shot twice, spheres in order."""
+    refuse_masked("views", [[view.centres_mm, view.covariances_mm2] for view in views])
+    refuse_masked("base_from_flange", list(base_from_flange))
+    refuse_masked("touched_mm", touched_mm)
     names = tuple(view.shot for view in views)
     poses = [np.asarray(pose, dtype=np.float64) for pose in base_from_flange]
     if not views or len(poses) != len(views):

@@ -20,6 +20,7 @@ from weldscan._weldcore import (
     estimate_phase_error,
     harmonics_of_gamma,
     phase_error_of_harmonics,
+    refuse_masked,
 )
 from weldscan.errors import GeometryError, InputError
 from weldscan.records.frames import read_frames
@@ -77,6 +78,8 @@ def estimate_response(
         >>> round(response.gamma, 1)
         1.5
     """
+    refuse_masked("images", images)
+    refuse_masked("mask", mask)
     frames = [np.asarray(image) for image in images]
     needed = sum(steps for _, steps in fringes)
     if not fringes or len(frames) != needed:
@@ -220,6 +223,8 @@ def compensate_phase(
         >>> bool(np.abs(np.angle(np.exp(1j * (found - true)))).max() < 0.01)
         True
     """
+    refuse_masked("wrapped", wrapped)
+    refuse_masked("mask", mask)
     phases = np.asarray(wrapped, dtype=np.float64)
     if phases.ndim == 3:
         many = [steps] * len(phases) if isinstance(steps, int) else list(steps)
@@ -309,6 +314,8 @@ def response_of_ramp(level: ArrayLike, light: ArrayLike, *, noise: float = 0.0) 
         >>> round(response_of_ramp(level, [10 + 180 * (v / 255) ** 2.2 for v in level]).gamma, 2)
         2.2
     """
+    refuse_masked("level", level)
+    refuse_masked("light", light)
     levels, lights = np.asarray(level, np.float64), np.asarray(light, np.float64)
     if levels.ndim != 1 or levels.shape != lights.shape:
         raise InputError(f"ramp: {levels.shape} levels for {lights.shape} lights")

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from weldscan._weldcore import refuse_masked
 from weldscan.calibration import bundle, volume
 from weldscan.calibration.board import LEAST_FEATURES, Board, find_board, handedness, parse_board
 from weldscan.calibration.captures import Stack, phases_at, read_stack, saturated_share
@@ -331,6 +332,7 @@ def _without_bias(f: bundle.Features, views: Sequence[BoardView], model: bundle.
 
 
 def _array(value: ArrayLike, shape: tuple[int, ...], what: str, *, gaps: bool = False) -> Floats:
+    refuse_masked(what, value)
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):

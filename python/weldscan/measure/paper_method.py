@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import KdTree, register_icp
+from weldscan._weldcore import KdTree, refuse_masked, register_icp
 from weldscan.errors import GeometryError
 from weldscan.result import Histogram
 
@@ -48,6 +48,9 @@ def paper_step(points_mm: Floats, axis_point_mm: Floats, axis: Floats, radius_mm
     Raises:
         GeometryError: one of the parts has no points left, or ICP found nothing to hold on to.
     """
+    refuse_masked("points_mm", points_mm)
+    refuse_masked("axis_point_mm", axis_point_mm)
+    refuse_masked("axis", axis)
     points_mm = points_mm[:: max(1, len(points_mm) // POINTS)]
     axial = (points_mm - axis_point_mm) @ axis
     excess = centroid_excess(points_mm, axial, axis_point_mm, axis, radius_mm)

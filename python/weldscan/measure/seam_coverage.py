@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ UNEXPLAINED_PART = 0.10
 SATURATED_PART, LOST_PART = 0.50, 0.75
 # Three sigma of what is stated with k = 2.
 CONTRADICTION = 1.5
-# One station in a row may show nothing: what begins and ends within 4 mm of the seam is no misalignment.
+# A bin with points that lies so near a station that was read: a hole at the toe is no gap of the seam.
 REACH_STATIONS = 1.25
 # A bin with fewer pixels is the sliver of a view.
 LEAST_PIXELS = 50
@@ -191,17 +192,28 @@ def _ends(view: PartView, inside: NDArray[np.bool_], steep: Floats) -> list[floa
     return ends
 
 
-def _beside_read(views: Sequence[PartView]) -> set[int]:
-    """The bins so near a station that was read that one more at most lies between it and the next one, or the end."""
+def _beside_read(views: Sequence[PartView], near: Sequence[NDArray[np.uint32]]) -> set[int]:
+    """The bins that hold points beside a station that was read, where holes at the toes kept their own from being read.
+
+    Where nothing is seen, all may be: a dark bin is a gap however short.
+    """
     found: set[int] = set()
-    for view in views:
+    for view, table in zip(views, near, strict=True):
         shot = view.shot
         reach_deg = REACH_STATIONS * math.degrees(shot.station_mm / shot.radius_mm)
         read = shot.sections["angle_deg"][np.isfinite(shot.sections["edge_step_mm"])]
+        sampled = _lost(table) <= LOST_PART
         for at in read.tolist():
             first, last = math.ceil((at - reach_deg) / BIN_DEG), math.floor((at + reach_deg) / BIN_DEG)
-            found.update(k % BINS for k in range(first, last + 1))
+            found.update(k % BINS for k in range(first, last + 1) if sampled[k % BINS])
     return found
+
+
+def _lost(near: NDArray[Any]) -> Floats:
+    """The share of the pixels at the weld that were not measured, by bin; infinite where hardly any are there."""
+    total = near.sum(axis=-1)
+    share = 1 - near[..., POINTS].sum(axis=-1) / np.maximum(total, 1)
+    return np.where(total >= LEAST_PIXELS, share, np.inf)
 
 
 def coverage_of(measured: Iterable[int], expected: Iterable[int], required_deg: float | None, by: str) -> Coverage:
@@ -270,7 +282,8 @@ def seam_of(
     for whole, _ in tables:
         every += whole
     expected = expected_bins(views, scanner)
-    coverage = coverage_of(measured | (_beside_read(views) & expected), expected, required_deg, required_by)
+    beside = _beside_read(views, [near for _, near in tables]) & expected
+    coverage = coverage_of(measured | beside, expected, required_deg, required_by)
     wanted = set(range(BINS)) if coverage.required_deg >= 360 else expected
     caps = _caps(views)
     bins = tuple(
@@ -348,15 +361,13 @@ def _of_lost(
         return []
     of_seam, in_view = (np.isin(np.arange(BINS), list(bins)) for bins in (judged, expected))
     run = max(math.ceil(2 * math.degrees(view.shot.station_mm / view.shot.radius_mm) / BIN_DEG) for view in views)
-    table = np.stack(near).astype(np.float64)
+    table = np.stack(near)
     total = table.sum(axis=2)
-    filled = total >= LEAST_PIXELS
-    shares = {
-        "saturated": table[:, :, INDEX["saturated"]] / np.maximum(total, 1),
-        "lost": 1 - table[:, :, POINTS].sum(axis=2) / np.maximum(total, 1),
-    }
+    lost = _lost(table)
+    saturated = np.where(np.isfinite(lost), table[:, :, INDEX["saturated"]] / np.maximum(total, 1), np.inf)
+    shares = {"saturated": saturated, "lost": lost}
     # By the view that shows a bin best; a view without pixels there says nothing.
-    best = {name: np.where(filled, share, np.inf).min(axis=0) for name, share in shares.items()}
+    best = {name: share.min(axis=0) for name, share in shares.items()}
     findings = []
     flanks = "saturated: what is left is no sample of its surface; scan with a shorter exposure"
     rules = (
@@ -368,7 +379,7 @@ def _of_lost(
         lasting = np.min([np.roll(share, -off) for off in range(run)], axis=0)
         if lasting.max() > part:
             k = int(np.argmax(lasting))
-            view = views[int(np.argmin(np.where(filled[:, k], shares[name][:, k], np.inf)))].name
+            view = views[int(np.argmin(shares[name][:, k]))].name
             said = f"{100 * share[k]:.0f} % of the pixels at the weld were {text}"
             findings.append(bar(code, said, view, BIN_DEG * k))
             break

@@ -161,7 +161,7 @@ def held_against_record(session: Session, faults: Sequence[Fault]) -> list[Findi
 
     Args:
         session: as `read_session` gave it.
-        faults: of its folder, as `weldscan.manifest.faults` found them.
+        faults: of its folder, as `weldscan.records.shot.faults` found them.
 
     Returns:
         Bars `shot-missing`, `shot-altered` and `description`. None for a session that no scan wrote.

@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, PrivateAttr, SerializerFunctionWrapHandler, model_serializer, model_validator
 
+from weldscan._weldcore import refuse_masked
 from weldscan.errors import InputError
 from weldscan.records.fields import PARALLEL_SINE, Model, PlainName, Positive, Real, Vector, plain_name, read_model
 from weldscan.records.files import read_bytes, to_json, whole_folder, write_synced
@@ -364,6 +365,7 @@ def write_session(
 
 
 def _write_image(path: Path, image: Image, size: tuple[int, int]) -> None:
+    refuse_masked("frames", image)
     if image.shape != size or image.dtype not in (np.uint8, np.uint16):
         raise InputError(
             f"frames: {path.parent.name}/{path.name} is {image.shape} {image.dtype}, not {size} uint8 or uint16"

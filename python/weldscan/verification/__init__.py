@@ -9,7 +9,7 @@ Each at every position that the session has; the one furthest from zero is judge
 guard band of ISO 14253-1. Every pixel that looks at the standard counts: what the scanner gave a point for is part of
 the result, however far off. What the standard is - which pixels look at it - is decided by geometry alone.
 
-`history.py` tells how it changes.
+`weldscan.records.history` keeps what was found, `history.py` says what it means.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from weldscan._weldcore import fit_plane, fit_sphere
+from weldscan._weldcore import fit_plane, fit_sphere, refuse_masked
 from weldscan.errors import GeometryError, InputError
 
 Floats = NDArray[np.float64]
@@ -154,6 +154,7 @@ def flatness_error(points_mm: ArrayLike, share: float = 1.0) -> FormError:
 
 
 def _points(points_mm: ArrayLike) -> Floats:
+    refuse_masked("points_mm", points_mm)
     points = np.ascontiguousarray(points_mm, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 5:
         raise InputError(f"points_mm: must be (n, 3) with n >= 5, got shape {points.shape}")

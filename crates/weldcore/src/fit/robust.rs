@@ -13,6 +13,7 @@ use super::sphere::{self, Sphere};
 use super::{Fit, Noise};
 use crate::Vec3;
 use crate::error::{Error, Result, require_count, require_finite, require_positive};
+use crate::memory::require;
 use crate::threads;
 
 /// A robust fit: the fit on the inliers, and their indices, ascending.
@@ -142,6 +143,7 @@ pub fn cylinder(
 fn check(what: &'static str, points: &[[f64; 3]], needed: usize, sigma_mm: Option<f64>) -> Result<()> {
     require_finite("points", points)?;
     require_count("points", needed, points.len())?;
+    require(points.len(), 80);
     if let Some(sigma) = sigma_mm {
         require_positive("sigma_mm", sigma)?;
     }

@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 
 use super::boxes::{max, min};
+use crate::stop::polled;
 
 /// Fewer queries than this are not worth ordering.
 const FEW: usize = 8 * 1024;
@@ -71,6 +72,7 @@ pub(crate) fn for_chunks<T: Send + Sync + Copy>(
     let run = |queries: &[[f64; 3]], answers: &mut [T]| {
         (queries.par_chunks(chunk), answers.par_chunks_mut(chunk))
             .into_par_iter()
+            .inspect(polled)
             .for_each(|(queries, answers)| job(queries, answers));
     };
     let Some(order) = order_along(queries) else { return run(queries, answers) };

@@ -2,6 +2,8 @@
 
 use rayon::prelude::*;
 
+use crate::stop::poll;
+
 /// Children of a node: one AVX-512 vector, two of AVX2.
 pub(crate) const WIDTH: usize = 8;
 /// Ranges below this are ordered without handing half of them to another thread.
@@ -181,6 +183,7 @@ fn split(items: &mut [Item], mut reach: usize) {
     }
     let (low, high) = items.split_at_mut(middle);
     if low.len() > SERIAL {
+        poll();
         rayon::join(|| split(low, reach), || split(high, reach));
     } else {
         split(low, reach);

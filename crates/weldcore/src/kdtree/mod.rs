@@ -14,6 +14,8 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 use crate::error::{Error, Result, require_count, require_finite};
+use crate::memory::require;
+use crate::stop::{poll, polled};
 use crate::threads;
 
 mod along;
@@ -26,6 +28,8 @@ pub(crate) use boxes::{Aside, BoxTree, Extent, Item, Visit, WIDTH, at_most, max,
 const QUERIES: usize = 1024;
 /// Coordinates beyond this would overflow when squared.
 pub const LARGEST_COORDINATE: f64 = 1e150;
+/// More neighbours than this take their time to be put in order.
+const MANY: usize = 4096;
 /// No neighbour yet: every real one is nearer.
 const FAR: f64 = f64::MAX;
 /// Not a place.
@@ -62,6 +66,7 @@ impl KdTree {
             let expected = "fewer than 2^32 points".into();
             return Err(Error::OutOfRange { what, expected, value: points.len().to_string() });
         }
+        require(points.len(), 80);
         Ok(threads::install(|| Self::build(points)))
     }
 
@@ -71,6 +76,7 @@ impl KdTree {
         let blank = (Leaf([[f64::INFINITY; WIDTH]; 3]), [u32::MAX; WIDTH]);
         let (leaves, indices): (Vec<Leaf>, Vec<[u32; WIDTH]>) = items
             .par_chunks(WIDTH)
+            .inspect(polled)
             .map(|chunk| {
                 let (mut leaf, mut index) = blank;
                 for (place, item) in chunk.iter().enumerate() {
@@ -92,6 +98,19 @@ impl KdTree {
         self.len
     }
 
+    /// The points, as they were given.
+    pub fn points(&self) -> Vec<[f64; 3]> {
+        require(self.len, 24);
+        let mut points = vec![[0.0; 3]; self.len];
+        for place in 0..self.places() as u32 {
+            let (point, index) = self.in_place(place);
+            if let Some(to) = points.get_mut(index as usize) {
+                *to = point;
+            }
+        }
+        points
+    }
+
     /// Whether the tree holds no point; it always holds one.
     pub fn is_empty(&self) -> bool {
         self.len == 0
@@ -108,6 +127,7 @@ impl KdTree {
     /// [`Error::NonFinite`] and [`Error::OutOfRange`] as in [`KdTree::new`].
     pub fn nearest(&self, queries: &[[f64; 3]]) -> Result<(Vec<f64>, Vec<u32>)> {
         require_range("queries", queries)?;
+        require(queries.len(), 96);
         let mut found = vec![Nearest { squared: FAR, index: u32::MAX }; queries.len()];
         Ok(threads::install(|| {
             for_chunks(queries, &mut found, QUERIES, |queries, found| nearest_of(self, queries, found));
@@ -118,6 +138,7 @@ impl KdTree {
     /// The distance of the nearest point to each query, mm, negative where the query is behind that point's normal.
     pub(crate) fn signed(&self, queries: &[[f64; 3]], normals: &[[f64; 3]]) -> Result<Vec<f64>> {
         require_range("points", queries)?;
+        require(queries.len(), 72);
         let mut distance = vec![0.0; queries.len()];
         threads::install(|| for_chunks(queries, &mut distance, QUERIES, |q, d| signed_of(self, normals, q, d)));
         Ok(distance)
@@ -139,6 +160,7 @@ impl KdTree {
             let expected = "small enough for its answer to fit into memory".into();
             return Err(Error::OutOfRange { what: "k", expected, value: k.to_string() });
         };
+        require(wanted, 12);
         let (mut distance, mut index) = (vec![0.0; wanted], vec![0; wanted]);
         threads::install(|| {
             let chunks = (distance.par_chunks_mut(QUERIES * k), index.par_chunks_mut(QUERIES * k));
@@ -158,6 +180,7 @@ impl KdTree {
         if r_mm.is_nan() || r_mm < 0.0 {
             return Err(Error::OutOfRange { what: "r", expected: "at least 0".into(), value: r_mm.to_string() });
         }
+        require(queries.len(), 2 * size_of::<Within>());
         let chunks: Vec<Vec<Within>> =
             threads::install(|| queries.par_chunks(QUERIES).map(|queries| within_of(self, queries, r_mm)).collect());
         Ok(chunks.into_iter().flatten().collect())
@@ -244,16 +267,19 @@ impl Follower {
     /// As [`KdTree::nearest`].
     pub fn nearest(&mut self, tree: &KdTree, queries: &[[f64; 3]]) -> Result<(Vec<f64>, Vec<u32>)> {
         require_range("queries", queries)?;
+        require(queries.len(), 200);
         Ok(threads::install(|| {
             if self.steps.len() != queries.len() {
-                self.steps = vec![Step::NEW; queries.len()];
-                self.order = order_along(queries);
+                // Both or, where the call ends here, none.
+                let (steps, order) = (vec![Step::NEW; queries.len()], order_along(queries));
+                (self.steps, self.order) = (steps, order);
             }
             let mut found = vec![(0.0, 0); queries.len()];
             let steps = &mut self.steps;
             let run = |queries: &[[f64; 3]], steps: &mut Vec<Step>, found: &mut [(f64, u32)]| {
                 (queries.par_chunks(QUERIES), steps.par_chunks_mut(QUERIES), found.par_chunks_mut(QUERIES))
                     .into_par_iter()
+                    .inspect(polled)
                     .for_each(|(queries, steps, found)| follow_all(tree, queries, steps, found));
             };
             let Some(order) = &self.order else {
@@ -458,6 +484,9 @@ impl Found for NearestK<'_> {
     #[inline(always)]
     fn offer(&mut self, squared: f64, index: u32, _: u32) {
         let mut at = self.squared.len();
+        if at > MANY {
+            poll();
+        }
         while at > 0
             && (squared < self.squared[at - 1] || (squared == self.squared[at - 1] && index < self.index[at - 1]))
         {
@@ -491,6 +520,10 @@ impl Found for WithinRadius {
     fn offer(&mut self, squared: f64, index: u32, _: u32) {
         let distance = squared.sqrt();
         if distance <= self.r {
+            if self.all.len() == self.all.capacity() {
+                poll();
+                require(2 * self.all.len(), size_of::<(f64, u32)>());
+            }
             self.all.push((distance, index));
         }
     }
@@ -554,6 +587,7 @@ fn nearest_k_of(tree: &KdTree, queries: &[[f64; 3]], k: usize, distance: &mut [f
 fn plain_nearest_k_of(tree: &KdTree, queries: &[[f64; 3]], k: usize, distance: &mut [f64], index: &mut [u32]) {
     let mut aside = Aside::new();
     for ((q, distance), index) in queries.iter().zip(distance.chunks_mut(k)).zip(index.chunks_mut(k)) {
+        poll();
         distance.fill(FAR);
         index.fill(u32::MAX);
         tree.search(q, &mut aside, &mut NearestK { squared: distance, index });
@@ -577,8 +611,10 @@ fn plain_within_of(tree: &KdTree, queries: &[[f64; 3]], r: f64) -> Vec<Within> {
     let mut found = WithinRadius { bound, r, all: Vec::new() };
     let mut answers = Vec::with_capacity(queries.len());
     for q in queries {
+        poll();
         tree.search(q, &mut aside, &mut found);
         found.all.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        require(found.all.len(), 12);
         let (distance_mm, index) = found.all.drain(..).unzip();
         answers.push(Within { distance_mm, index });
     }

@@ -4,6 +4,7 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 use super::{PhaseMap, Reason};
+use crate::stop::polled;
 use crate::threads;
 
 /// Rows that a thread takes at a time.
@@ -37,7 +38,8 @@ pub(super) fn reject_jumps(map: &mut PhaseMap, half_fringe_px: f64) {
         found
     };
     let bands = map.height.div_ceil(ROWS);
-    let found: Vec<Vec<usize>> = threads::install(|| (0..bands).into_par_iter().map(band_jumps).collect());
+    let found: Vec<Vec<usize>> =
+        threads::install(|| (0..bands).into_par_iter().inspect(polled).map(band_jumps).collect());
     for at in found.into_iter().flatten() {
         if let (Some(c), Some(s), Some(r)) =
             (map.column_px.get_mut(at), map.sigma_px.get_mut(at), map.reason.get_mut(at))

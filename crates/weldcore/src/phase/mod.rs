@@ -30,7 +30,8 @@ pub(crate) use wave::{round, round64};
 pub use wrapped::{WrappedPhase, decode_phase};
 
 use crate::error::{Error, Result, require_positive};
-use crate::memory::{filled, room};
+use crate::memory::{filled, require, room};
+use crate::stop::polled;
 use crate::threads::{self, CHUNK};
 use crate::unwrap::Plan;
 use jumps::reject_jumps;
@@ -189,21 +190,24 @@ pub fn decode_shot<T: Level>(
         .compensating(&phase_error);
 
     let n = shot.width * shot.height;
+    require(n, 40);
     let (mut column, mut sigma, mut reason) = (room::<f64>(n), room::<f32>(n), room::<u8>(n));
     let (mut modulation, mut background) = (room::<f32>(n), room::<f32>(n));
     threads::install(|| {
         let floats = sigma.par_chunks_mut(CHUNK).zip(modulation.par_chunks_mut(CHUNK));
         let floats = floats.zip(background.par_chunks_mut(CHUNK));
         let columns = column.par_chunks_mut(CHUNK).zip(reason.par_chunks_mut(CHUNK));
-        columns.zip(floats).enumerate().for_each(|(chunk, ((column, reason), ((sigma, modulation), background)))| {
-            let mut work = Work::new(sets.len());
-            let tiles = column.chunks_mut(TILE).zip(reason.chunks_mut(TILE));
-            let floats = sigma.chunks_mut(TILE).zip(modulation.chunks_mut(TILE)).zip(background.chunks_mut(TILE));
-            for (tile, ((column, reason), ((sigma, modulation), background))) in tiles.zip(floats).enumerate() {
-                let results = Results { column, sigma, modulation, background, reason };
-                decoder.tile(chunk * CHUNK + tile * TILE, &mut work, results);
-            }
-        });
+        columns.zip(floats).inspect(polled).enumerate().for_each(
+            |(chunk, ((column, reason), ((sigma, modulation), background)))| {
+                let mut work = Work::new(sets.len());
+                let tiles = column.chunks_mut(TILE).zip(reason.chunks_mut(TILE));
+                let floats = sigma.chunks_mut(TILE).zip(modulation.chunks_mut(TILE)).zip(background.chunks_mut(TILE));
+                for (tile, ((column, reason), ((sigma, modulation), background))) in tiles.zip(floats).enumerate() {
+                    let results = Results { column, sigma, modulation, background, reason };
+                    decoder.tile(chunk * CHUNK + tile * TILE, &mut work, results);
+                }
+            },
+        );
     });
     // SAFETY: the chunks cover the images, and their tiles, of at most `TILE` pixels, the chunks; a tile writes them all.
     let (column_px, sigma_px, reason) = unsafe { (filled(column), filled(sigma), filled(reason)) };

@@ -17,6 +17,7 @@ use rayon::prelude::*;
 
 use super::wave::Level;
 use super::{FringeSet, Shot};
+use crate::stop::polled;
 use crate::threads;
 
 /// Variance of rounding to whole grey levels.
@@ -217,7 +218,7 @@ pub(crate) fn estimate<T: Level>(shot: &Shot<'_, T>, sets: &[FringeSet], saturat
         }
         [across, along]
     };
-    let found: Vec<[Bands; 2]> = threads::install(|| rows.par_iter().map(look).collect());
+    let found: Vec<[Bands; 2]> = threads::install(|| rows.par_iter().inspect(polled).map(look).collect());
     let (mut across, mut along) = (Bands::default(), Bands::default());
     for [a, b] in found {
         across.append(a);

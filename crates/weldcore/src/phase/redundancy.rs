@@ -17,6 +17,7 @@ use super::noise::sample_rows;
 use super::response::{self, PhaseError, sine_series};
 use super::wave::{Level, Wave, round64, turns};
 use super::{FringeSet, Noise, Shot};
+use crate::stop::polled;
 use crate::threads;
 use crate::unwrap::Plan;
 
@@ -617,7 +618,7 @@ fn jolt<T: Level>(
             });
             each.min_by(|a, b| a.2.total_cmp(&b.2))
         };
-        let found: Vec<_> = threads::install(|| places.par_iter().map(one).collect());
+        let found: Vec<_> = threads::install(|| places.par_iter().inspect(polled).map(one).collect());
         let found: Vec<_> = found.into_iter().flatten().collect();
         // Along the fringes nearly any displacement will do: the smallest that is as good.
         let best = found.iter().map(|f| f.2).fold(f64::INFINITY, f64::min);
@@ -696,8 +697,9 @@ fn explain<T: Level>(
     };
     let mut found: Option<(f64, Cause)> = None;
     if few.len() >= FEWEST {
-        let left: Vec<f64> =
-            threads::install(|| causes.par_iter().map(|c| court.hear(&few, &c.reading, errors).disorder).collect());
+        let left: Vec<f64> = threads::install(|| {
+            causes.par_iter().inspect(polled).map(|c| court.hear(&few, &c.reading, errors).disorder).collect()
+        });
         let best = left.iter().copied().fold(f64::INFINITY, f64::min);
         let as_good = |l: f64| l <= AS_GOOD * best + 0.25 * ORDERLY;
         // What one set does alone, all may do together: two sets cannot tell.

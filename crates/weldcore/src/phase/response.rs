@@ -18,6 +18,7 @@ use super::kernel::demodulate;
 use super::wave::{Lane, Level, Sinusoid, TILE, Wave, round, turns};
 use super::{FringeSet, Noise, Shot};
 use crate::error::{Error, Result, require_positive};
+use crate::stop::polled;
 use crate::threads;
 
 /// Terms in the measured phase: with three steps and a gamma of 2.2 the sixteenth is 0.1 mrad.
@@ -199,7 +200,8 @@ pub(super) fn seen_in_shot<T: Level>(
         let row = |y: usize| shot_row(shot, start, set.steps, &wave, noise, saturation, y);
         seen_in_rows(shot.width, shot.height, &row, set.steps, z, ROWS)
     };
-    let found: Vec<Option<PhaseError>> = threads::install(|| sets.par_iter().zip(&starts).map(look).collect());
+    let found: Vec<Option<PhaseError>> =
+        threads::install(|| sets.par_iter().inspect(polled).zip(&starts).map(look).collect());
     // A coarse set cannot show its error; the next finer one of as many steps that shows one speaks for it.
     let speaks = |set: &FringeSet| {
         let same = sets.iter().zip(&found).filter(|(s, _)| s.steps == set.steps && s.periods > set.periods);

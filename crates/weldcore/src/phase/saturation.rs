@@ -11,6 +11,7 @@ use rayon::prelude::*;
 use super::Shot;
 use super::noise::sample_rows;
 use super::wave::Level;
+use crate::stop::polled;
 use crate::threads;
 
 /// Every so many of the rows at which the noise is taken.
@@ -80,7 +81,7 @@ fn scale_of<T: Level>(frames: &[&[T]]) -> (u32, u32) {
             (top.max(v), bits | v)
         })
     };
-    let seen: Vec<(u32, u32)> = threads::install(|| frames.par_iter().map(scan).collect());
+    let seen: Vec<(u32, u32)> = threads::install(|| frames.par_iter().inspect(polled).map(scan).collect());
     let (top, bits) = seen.iter().fold((0, 0), |(top, bits), s| (top.max(s.0), bits | s.1));
     let shift = if bits == 0 { 0 } else { bits.trailing_zeros() };
     let full = [8, 10, 12, 14, 16].map(|b| (1u32 << b) - 1);
@@ -111,7 +112,7 @@ fn histogram<T: Level>(frames: &[&[T]], rows: &[usize], width: usize, per_bin: u
         a.iter_mut().zip(&b).for_each(|(a, b)| *a += b);
         a
     };
-    threads::install(|| frames.par_iter().enumerate().map(count).reduce(|| vec![0u32; bins], add))
+    threads::install(|| frames.par_iter().inspect(polled).enumerate().map(count).reduce(|| vec![0u32; bins], add))
 }
 
 /// The lowest bin of a pile-up at the upper end of a histogram.

@@ -5,6 +5,8 @@ use rayon::prelude::*;
 
 use super::wave::{TILE, Wave, atan2};
 use crate::error::{Error, Result};
+use crate::memory::require;
+use crate::stop::polled;
 use crate::threads::{self, CHUNK};
 
 /// What [`decode_phase`] found; everything set after set, each row-major.
@@ -81,6 +83,7 @@ pub fn decode_phase<T: Copy + Into<f64> + Sync>(images: &[&[T]], steps: &[usize]
         return Err(Error::Shape { what: "images", expected, got: format!("{} pixels", other.len()) });
     }
     let size = n * steps.len();
+    require(size, 20);
     let mut out = WrappedPhase {
         phase_rad: vec![0.0; size],
         modulation: vec![0.0; size],
@@ -104,7 +107,7 @@ pub fn decode_phase<T: Copy + Into<f64> + Sync>(images: &[&[T]], steps: &[usize]
         threads::install(|| {
             let chunks = phase.par_chunks_mut(CHUNK).zip(modulation.par_chunks_mut(CHUNK));
             let chunks = chunks.zip(background.par_chunks_mut(CHUNK).zip(rest.par_chunks_mut(CHUNK)));
-            chunks.enumerate().for_each(|(i, ((phase, modulation), (background, rest)))| {
+            chunks.inspect(polled).enumerate().for_each(|(i, ((phase, modulation), (background, rest)))| {
                 let tiles = phase.chunks_mut(TILE).zip(modulation.chunks_mut(TILE));
                 let tiles = tiles.zip(background.chunks_mut(TILE).zip(rest.chunks_mut(TILE)));
                 for (j, ((phase, modulation), (background, rest))) in tiles.enumerate() {

@@ -5,7 +5,7 @@ use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArray2, PyUntypedAr
 use pyo3::prelude::*;
 
 use super::kdtree::PyKdTree;
-use super::{compute, float_matrix, floats, points, raise};
+use super::{compute, float_matrix, floats, points, raise, unmasked};
 use crate::Vec3;
 use crate::distance::{self, Cylinder, Plane, Sphere, Surface, Target};
 use crate::error::{Error, Result};
@@ -181,7 +181,11 @@ impl PyCylinder {
 ///     >>> Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 ///     Mesh(4 vertices, 4 triangles, closed)
 #[pyclass(frozen, module = "weldscan", name = "Mesh")]
-pub(crate) struct PyMesh(pub(crate) Mesh);
+pub(crate) struct PyMesh {
+    pub(crate) mesh: Mesh,
+    /// Vertices and triangles as they came: what it is pickled as.
+    pub(super) given: (Vec<[f64; 3]>, Vec<[u32; 3]>),
+}
 
 #[pymethods]
 impl PyMesh {
@@ -191,23 +195,24 @@ impl PyMesh {
         let vertices = float_matrix("vertices", vertices)?;
         let vertices = points("vertices", &vertices)?;
         let triangles = indices("triangles", triangles)?;
-        Ok(Self(compute(py, || Mesh::new(vertices, &triangles))?))
+        let mesh = compute(py, || Mesh::new(vertices, &triangles))?;
+        Ok(Self { mesh, given: (vertices.to_vec(), triangles) })
     }
 
     /// How many triangles count: those with an area.
     #[getter]
     fn triangles(&self) -> usize {
-        self.0.triangles()
+        self.mesh.triangles()
     }
 
     /// Whether it has an inside: every edge belongs to two triangles that face the same way.
     #[getter]
     fn closed(&self) -> bool {
-        self.0.closed()
+        self.mesh.closed()
     }
 
     fn __repr__(&self) -> String {
-        format!("{:?}", self.0)
+        format!("{:?}", self.mesh)
     }
 }
 
@@ -215,6 +220,7 @@ impl PyMesh {
 fn indices(what: &'static str, given: &Bound<'_, PyAny>) -> PyResult<Vec<[u32; 3]>> {
     let py = given.py();
     let wrong = |got: String| raise(py, &Error::Shape { what, expected: "integers of shape (m, 3)".into(), got });
+    unmasked(what, given)?;
     let array = py.import("numpy")?.call_method1("asarray", (given,)).map_err(|_| wrong("another object".into()))?;
     let dtype = array.getattr("dtype")?;
     let shape: Vec<usize> = array.getattr("shape")?.extract()?;
@@ -280,7 +286,7 @@ impl<'py> Given<'py> {
                 compute(py, || job(&Target::Cloud(&tree_of(target)?, normals)))
             }
             Self::Mesh(mesh) => {
-                let mesh = &mesh.get().0;
+                let mesh = &mesh.get().mesh;
                 compute(py, || job(&Target::Mesh(mesh)))
             }
             Self::Surface(surface) => compute(py, || job(&Target::Surface(*surface))),

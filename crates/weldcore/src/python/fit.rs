@@ -14,7 +14,7 @@ fn shape_error(py: Python<'_>, what: &'static str, expected: &str, shape: &[usiz
 
 /// A sphere found by `find_spheres`.
 #[pyclass(frozen, module = "weldscan")]
-pub(crate) struct FoundSphere(spheres::Found);
+pub(crate) struct FoundSphere(pub(super) spheres::Found);
 
 #[pymethods]
 impl FoundSphere {
@@ -139,11 +139,11 @@ fn vector<'py>(py: Python<'py>, v: &Vec3) -> Bound<'py, PyArray1<f64>> {
 }
 
 /// What the three results have in common.
-struct Common {
-    rms_mm: f64,
-    covariance: Vec<Vec<f64>>,
-    iterations: usize,
-    inliers: Option<Vec<usize>>,
+pub(super) struct Common {
+    pub(super) rms_mm: f64,
+    pub(super) covariance: Vec<Vec<f64>>,
+    pub(super) iterations: usize,
+    pub(super) inliers: Option<Vec<usize>>,
 }
 
 impl Common {
@@ -172,8 +172,8 @@ macro_rules! result_class {
         $(#[$doc])*
         #[pyclass(frozen, module = "weldscan")]
         pub(crate) struct $name {
-            surface: $surface,
-            common: Common,
+            pub(super) surface: $surface,
+            pub(super) common: Common,
         }
 
         impl $name {

@@ -16,7 +16,7 @@ use crate::normals;
 /// A direction along which `register_icp` did not move the pose, because the pairs do not show it.
 #[pyclass(frozen, module = "weldscan", name = "WeakDirection")]
 #[derive(Clone)]
-pub(crate) struct PyWeak(Weak);
+pub(crate) struct PyWeak(pub(super) Weak);
 
 #[pymethods]
 impl PyWeak {
@@ -62,7 +62,7 @@ impl PyWeak {
 
 /// What `register_icp` found.
 #[pyclass(frozen, module = "weldscan", name = "Registration")]
-pub(crate) struct PyRegistration(Registration);
+pub(crate) struct PyRegistration(pub(super) Registration);
 
 #[pymethods]
 impl PyRegistration {

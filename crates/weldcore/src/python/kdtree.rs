@@ -1,6 +1,6 @@
 //! The k-d tree as Python sees it.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, TryLockError};
 
 use numpy::ndarray::Array2;
 use numpy::{IntoPyArray, PyArray1, PyArray2};
@@ -159,8 +159,8 @@ impl PyKdTree {
 ///     [1]
 #[pyclass(frozen, module = "weldscan", name = "Follower")]
 pub(crate) struct PyFollower {
-    tree: Py<PyKdTree>,
-    follower: Mutex<Follower>,
+    pub(super) tree: Py<PyKdTree>,
+    pub(super) follower: Mutex<Follower>,
 }
 
 #[pymethods]
@@ -192,10 +192,19 @@ impl PyFollower {
         let queries = points("queries", &array)?;
         let tree = &self.tree.get().tree;
         let (distance, index) = compute(py, || {
-            // What a call that failed left behind is as good as any start.
-            self.follower.lock().unwrap_or_else(PoisonError::into_inner).nearest(tree, queries)
+            match self.follower.try_lock() {
+                Ok(mut follower) => follower.nearest(tree, queries),
+                // What a call that failed left behind is as good as any start.
+                Err(TryLockError::Poisoned(left)) => left.into_inner().nearest(tree, queries),
+                // Another thread, perhaps one that a fork has cut off, is not waited for.
+                Err(TryLockError::WouldBlock) => tree.nearest(queries),
+            }
         })?;
         Ok((distance.into_pyarray(py), index.into_pyarray(py)))
+    }
+
+    fn __repr__(&self) -> String {
+        format!("Follower({:?})", self.tree.get().tree)
     }
 }
 

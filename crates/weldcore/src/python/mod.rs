@@ -3,10 +3,12 @@
 //!
 //! A room of the core has a file of the same name here with a `register` function.
 
-use numpy::{PyArray, PyArrayMethods, PyReadonlyArray, PyReadonlyArray2, PyUntypedArrayMethods};
-use pyo3::exceptions::PyOverflowError;
+use std::cell::Cell;
+
+use numpy::{PyArray, PyArrayMethods, PyReadonlyArray, PyReadonlyArray2, PyUntypedArray, PyUntypedArrayMethods};
+use pyo3::exceptions::{PyKeyboardInterrupt, PyMemoryError, PyOverflowError};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyDict, PyFloat, PyList, PyTuple};
 
 mod distance;
 mod fit;
@@ -15,6 +17,7 @@ mod image;
 mod kdtree;
 mod normals;
 mod phase;
+mod pickle;
 mod response;
 mod scanner;
 mod segment;
@@ -24,6 +27,7 @@ mod triangulate;
 
 use crate::error::Error;
 use crate::memory::Recycler;
+use crate::stop::{Stopped, attended};
 use crate::transform::Transform;
 
 #[global_allocator]
@@ -46,9 +50,89 @@ pub(crate) fn raise_as(py: Python<'_>, class: &str, message: String) -> PyErr {
     }
 }
 
-/// Detaches from the interpreter, computes, and maps the error.
+/// Detaches from the interpreter, computes, and maps the error. On the thread that hears signals a long computation ends
+/// where one is to end it (Ctrl-C).
 pub(crate) fn compute<T: Send>(py: Python<'_>, job: impl FnOnce() -> crate::Result<T> + Send) -> PyResult<T> {
-    py.detach(job).map_err(|e| raise(py, &e))
+    crate::threads::threads().map_err(|e| raise(py, &e))?;
+    let main = is_main_thread(py)?;
+    let (done, raised) = py.detach(|| {
+        let raised = Cell::new(None);
+        let hears = || match Python::attach(|py| py.check_signals()) {
+            Ok(()) => false,
+            Err(error) => {
+                raised.set(Some(error));
+                true
+            }
+        };
+        let done = attended(main.then_some(&hears as &dyn Fn() -> bool), job);
+        (done, raised.into_inner())
+    });
+    match done {
+        Ok(result) => result.map_err(|e| raise(py, &e)),
+        Err(Stopped::OutOfMemory) => Err(PyMemoryError::new_err("not enough memory for this computation")),
+        Err(Stopped::OnRequest) => Err(raised.unwrap_or_else(|| PyKeyboardInterrupt::new_err(()))),
+    }
+}
+
+/// Whether this is the thread on which Python runs signal handlers. After a fork it may be another.
+fn is_main_thread(py: Python<'_>) -> PyResult<bool> {
+    thread_local! {
+        static KNOWN: Cell<Option<(u32, bool)>> = const { Cell::new(None) };
+    }
+    let process = std::process::id();
+    if let Some((of, main)) = KNOWN.get()
+        && of == process
+    {
+        return Ok(main);
+    }
+    let threading = py.import("threading")?;
+    let main = threading.call_method0("main_thread")?.getattr("ident")?.eq(threading.call_method0("get_ident")?)?;
+    KNOWN.set(Some((process, main)));
+    Ok(main)
+}
+
+/// Refuses what is, or holds, a numpy array with masked values: without its mask, what it hides would count.
+pub(crate) fn unmasked(what: &str, given: &Bound<'_, PyAny>) -> PyResult<()> {
+    let py = given.py();
+    if given.is_exact_instance_of::<PyUntypedArray>() || given.is_exact_instance_of::<PyFloat>() {
+        return Ok(());
+    }
+    if let Ok(list) = given.cast_exact::<PyList>() {
+        return list.iter().try_for_each(|item| unmasked(what, &item));
+    }
+    if let Ok(tuple) = given.cast_exact::<PyTuple>() {
+        return tuple.iter().try_for_each(|item| unmasked(what, &item));
+    }
+    if !given.is_instance_of::<PyUntypedArray>() {
+        return Ok(());
+    }
+    let ma = py.import("numpy.ma")?;
+    let hidden = || -> PyResult<usize> { ma.call_method1("getmaskarray", (given,))?.call_method0("sum")?.extract() };
+    match hidden()? {
+        0 => Ok(()),
+        n => {
+            let remedy = "leave them out, or fill them: `.filled(...)`";
+            Err(raise_as(py, "InputError", format!("{what}: {n} of its values are masked; {remedy}")))
+        }
+    }
+}
+
+/// Refuses an array, or lists of arrays, with masked values: without its mask, what it hides would count.
+///
+/// Args:
+///     what: the argument's name, for the message.
+///     given: what is to be looked at; what is no array passes.
+///
+/// Raises:
+///     InputError: says how many values are masked.
+#[pyfunction]
+fn refuse_masked(what: &str, given: &Bound<'_, PyAny>) -> PyResult<()> {
+    unmasked(what, given)
+}
+
+/// [`unmasked`], of a list of numbers.
+pub(crate) fn numbers(what: &'static str, given: &Bound<'_, PyAny>) -> PyResult<Vec<f64>> {
+    parts(what, "a list of numbers", given)
 }
 
 /// Whatever numpy takes for an array of real numbers, as a C-contiguous float64 array of `D` dimensions; an array that
@@ -58,6 +142,7 @@ pub(crate) fn floats<'py, D: numpy::ndarray::Dimension>(
     given: &Bound<'py, PyAny>,
 ) -> PyResult<PyReadonlyArray<'py, f64, D>> {
     let py = given.py();
+    unmasked(what, given)?;
     if let Ok(array) = given.cast::<PyArray<f64, D>>()
         && array.is_c_contiguous()
     {
@@ -67,10 +152,12 @@ pub(crate) fn floats<'py, D: numpy::ndarray::Dimension>(
         let dimensions = D::NDIM.map_or(String::new(), |n| format!(" of {n} dimensions"));
         raise(py, &Error::Shape { what, expected: format!("an array of real numbers{dimensions}"), got })
     };
-    let array = py
-        .import("numpy")?
-        .call_method1("asarray", (given,))
-        .map_err(|_| wrong(given.get_type().name().map_or("another object".into(), |n| n.to_string())))?;
+    let array = py.import("numpy")?.call_method1("asarray", (given,)).map_err(|e| {
+        match e.is_instance_of::<PyMemoryError>(py) {
+            true => e,
+            false => wrong(given.get_type().name().map_or("another object".into(), |n| n.to_string())),
+        }
+    })?;
     let dtype = array.getattr("dtype")?;
     if !"biuf".contains(&dtype.getattr("kind")?.extract::<String>()?) {
         return Err(wrong(format!("dtype {dtype}")));
@@ -134,6 +221,7 @@ where
     T: for<'a> FromPyObject<'a, 'py, Error = PyErr>,
 {
     let py = given.py();
+    unmasked(what, given)?;
     given.extract().map_err(|e: PyErr| {
         raise(py, &Error::Shape { what, expected: expected.into(), got: format!("another: {}", e.value(py)) })
     })
@@ -151,7 +239,19 @@ pub(crate) fn transform(what: &'static str, array: &PyReadonlyArray2<'_, f64>) -
     Transform::from_rows(&rows).map_err(|e| raise(py, &e))
 }
 
-/// Sets how many threads the core uses in this process; None returns to the default.
+/// Sets how many threads the core uses in this process.
+///
+/// Args:
+///     threads: 1 to 1024; None returns to the default: `WELDSCAN_THREADS`, else `RAYON_NUM_THREADS`, else the number of
+///         cores this process may use.
+///
+/// Raises:
+///     InputError: out of range, or the default is (`WELDSCAN_THREADS=0`).
+///
+/// Example:
+///     >>> from weldscan import set_threads
+///     >>> set_threads(2)
+///     >>> set_threads()
 #[pyfunction]
 #[pyo3(signature = (threads=None))]
 fn set_threads(py: Python<'_>, #[pyo3(from_py_with = whole_or_none)] threads: Option<usize>) -> PyResult<()> {
@@ -163,6 +263,7 @@ fn set_threads(py: Python<'_>, #[pyo3(from_py_with = whole_or_none)] threads: Op
 fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("__version__", env!("CARGO_PKG_VERSION"))?;
     m.add_function(wrap_pyfunction!(set_threads, m)?)?;
+    m.add_function(wrap_pyfunction!(refuse_masked, m)?)?;
     fit::register(m)?;
     scanner::register(m)?;
     phase::register(m)?;
@@ -176,5 +277,5 @@ fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
     image::register(m)?;
     normals::register(m)?;
     simulate::register(m)?;
-    Ok(())
+    pickle::register(m)
 }

@@ -7,7 +7,7 @@ use numpy::{
 use pyo3::prelude::*;
 
 use super::response::PyPhaseError;
-use super::{Whole, compute, float_matrix, floats, parts, raise, whole};
+use super::{Whole, compute, float_matrix, floats, numbers, parts, raise, unmasked, whole};
 use crate::error::Error;
 use crate::phase::{
     DecodeOptions, Disagreement, FringeSet, Level, PhaseMap, Shot, WrappedPhase, decode_phase as decode_phase_core,
@@ -29,17 +29,17 @@ pub(super) fn image<T: numpy::Element>(
 #[pyclass(frozen, get_all, module = "weldscan", name = "Disagreement")]
 pub(crate) struct PyDisagreement {
     /// The exposure that is concerned.
-    exposure: usize,
+    pub(super) exposure: usize,
     /// The fringe set that is concerned; None: several.
-    set: Option<usize>,
+    pub(super) set: Option<usize>,
     /// The frames of the exposure that are concerned, from 0.
-    frames: Vec<usize>,
+    pub(super) frames: Vec<usize>,
     /// The likely cause in one line; steps count from 0 in their set.
-    text: String,
+    pub(super) text: String,
     /// Share of the clear pixels that contradict the frames as they are stated.
-    share: f64,
+    pub(super) share: f64,
     /// How many times better the cause fits than the statement.
-    strength: f64,
+    pub(super) strength: f64,
 }
 
 #[pymethods]
@@ -54,36 +54,36 @@ impl PyDisagreement {
 pub(crate) struct PyPhaseMap {
     /// Projector column (row for fringes along y) that lights each pixel, px, pixel centres at whole numbers; NaN where
     /// rejected. float64.
-    column_px: Py<PyArray2<f64>>,
+    pub(super) column_px: Py<PyArray2<f64>>,
     /// Its standard deviation by noise, px; NaN where rejected. float32.
-    sigma_px: Py<PyArray2<f32>>,
+    pub(super) sigma_px: Py<PyArray2<f32>>,
     /// Amplitude of the finest fringes, grey levels, in the exposure that counts most. float32.
-    modulation: Py<PyArray2<f32>>,
+    pub(super) modulation: Py<PyArray2<f32>>,
     /// Mean level of the same images. float32.
-    background: Py<PyArray2<f32>>,
+    pub(super) background: Py<PyArray2<f32>>,
     /// 0 ok, 1 dark, 2 saturated, 3 fringe order in doubt, 4 no fit. uint8.
-    reason: Py<PyArray2<u8>>,
+    pub(super) reason: Py<PyArray2<u8>>,
     /// Number of pixels by reason: ok, dark, saturated, order in doubt, no fit.
-    counts: [usize; 5],
+    pub(super) counts: [usize; 5],
     /// Variance of the camera's read noise, grey levels squared.
-    noise_read_variance: f64,
+    pub(super) noise_read_variance: f64,
     /// Growth of the variance with the level: variance = noise_read_variance + 1/12 + noise_gain * level.
-    noise_gain: f64,
+    pub(super) noise_gain: f64,
     /// What the noise was seen in: "backgrounds", "residuals", "texture" (an upper bound) or "assumed".
-    noise_source: &'static str,
+    pub(super) noise_source: String,
     /// Level from which a pixel counts as saturated.
-    saturation: f64,
+    pub(super) saturation: f64,
     /// Whether the images show that the camera clips there, below the full scale of its numbers.
-    clipped_below_full_scale: bool,
+    pub(super) clipped_below_full_scale: bool,
     /// Where the frames contradict each other, and the likely cause. Empty for a stack that agrees with itself.
-    disagreements: Vec<Py<PyDisagreement>>,
+    pub(super) disagreements: Vec<Py<PyDisagreement>>,
     /// Per fringe set the rms of the higher harmonics over the amplitude (None with three steps, which show none).
     /// Above 0.05 or so the projector's gamma wants correcting.
-    harmonics: Vec<Option<f64>>,
+    pub(super) harmonics: Vec<Option<f64>>,
     /// Per fringe set what was taken off its phase.
-    phase_error: Vec<Py<PyPhaseError>>,
+    pub(super) phase_error: Vec<Py<PyPhaseError>>,
     /// The chain of frequencies by which the fringes were counted, periods over the projector.
-    unwrapped_by: Vec<f64>,
+    pub(super) unwrapped_by: Vec<f64>,
 }
 
 #[pymethods]
@@ -119,7 +119,7 @@ fn hand_over(py: Python<'_>, map: PhaseMap) -> PyResult<PyPhaseMap> {
         counts: map.counts,
         noise_read_variance: map.noise.read_variance,
         noise_gain: map.noise.gain,
-        noise_source: map.noise.source.name(),
+        noise_source: map.noise.source.name().into(),
         saturation: map.saturation,
         clipped_below_full_scale: map.clipped_below_full_scale,
         disagreements: disagreements.collect::<PyResult<_>>()?,
@@ -129,6 +129,7 @@ fn hand_over(py: Python<'_>, map: PhaseMap) -> PyResult<PyPhaseMap> {
 
 /// A frame as an array of `T`, or `None` where it is of another type.
 fn frame<'py, T: numpy::Element>(given: &Bound<'py, PyAny>) -> PyResult<Option<PyReadonlyArray2<'py, T>>> {
+    unmasked("an image", given)?;
     let Ok(array) = given.cast::<PyArray2<T>>() else { return Ok(None) };
     if array.is_c_contiguous() {
         return Ok(Some(array.readonly()));
@@ -260,6 +261,7 @@ fn decode(
         let items = given.try_iter().map_err(|_| wrong(given.get_type().to_string()))?;
         items.map(|item| Ok(item?.unbind())).collect()
     };
+    unmasked("exposures", exposures)?;
     let mut stacks = Vec::new();
     for stack in list(exposures)? {
         let frames: Vec<_> = list(stack.bind(py))?.into_iter().map(|f| f.into_bound(py)).collect();
@@ -327,13 +329,13 @@ fn saturation_level(py: Python<'_>, images: &Bound<'_, PyAny>) -> PyResult<(f64,
 #[pyclass(frozen, get_all, module = "weldscan", name = "WrappedPhase")]
 pub(crate) struct PyWrappedPhase {
     /// In (-pi, pi], rad. float64.
-    phase_rad: Py<PyArrayDyn<f64>>,
+    pub(super) phase_rad: Py<PyArrayDyn<f64>>,
     /// Amplitude, grey levels. float32.
-    modulation: Py<PyArrayDyn<f32>>,
+    pub(super) modulation: Py<PyArrayDyn<f32>>,
     /// Mean level. float32.
-    background: Py<PyArrayDyn<f32>>,
+    pub(super) background: Py<PyArrayDyn<f32>>,
     /// Root of the summed squared residuals over N - 3, grey levels; 0 with three steps. float32.
-    residual: Py<PyArrayDyn<f32>>,
+    pub(super) residual: Py<PyArrayDyn<f32>>,
 }
 
 #[pymethods]
@@ -368,6 +370,7 @@ enum Images<'py> {
 /// The images of an argument, and their shape.
 fn images<'py>(what: &'static str, given: &Bound<'py, PyAny>) -> PyResult<(Images<'py>, [usize; 2])> {
     let py = given.py();
+    unmasked(what, given)?;
     let wrong = |expected: &str, got: String| raise(py, &Error::Shape { what, expected: expected.into(), got });
     let Ok(items) = given.try_iter() else {
         return Err(wrong("a stack (N, H, W) or a list of (H, W) images", given.get_type().to_string()));
@@ -496,8 +499,9 @@ fn shaped<T: numpy::Element>(py: Python<'_>, values: Vec<T>, shape: &[usize]) ->
 ///     >>> bool(np.allclose(unwrap_temporal(wrapped, [1, 8]), truth))
 ///     True
 #[pyfunction]
-fn unwrap_temporal<'py>(wrapped: &Bound<'py, PyAny>, periods: Vec<f64>) -> PyResult<Py<PyArrayDyn<f64>>> {
+fn unwrap_temporal<'py>(wrapped: &Bound<'py, PyAny>, periods: &Bound<'py, PyAny>) -> PyResult<Py<PyArrayDyn<f64>>> {
     let py = wrapped.py();
+    let periods = numbers("periods", periods)?;
     let array: PyReadonlyArrayDyn<'_, f64> = floats("wrapped", wrapped)?;
     let shape = array.shape().to_vec();
     let Some((&sets, rest)) = shape.split_first() else {
@@ -555,6 +559,7 @@ fn unwrap_spatial<'py>(
     quality.as_ref().map_or(Ok(()), |q| same("quality", q.shape()))?;
     let mask: Option<PyReadonlyArray2<'_, bool>> = match mask {
         Some(given) => {
+            unmasked("mask", given)?;
             let numpy = py.import("numpy")?;
             let array = numpy.call_method1("ascontiguousarray", (given,)).ok();
             let array = array.and_then(|a| a.cast_into::<PyArray2<bool>>().ok()).ok_or_else(|| {

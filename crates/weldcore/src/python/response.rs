@@ -3,7 +3,7 @@
 use numpy::PyUntypedArrayMethods;
 use pyo3::prelude::*;
 
-use super::{compute, float_matrix, parts, raise, whole};
+use super::{compute, float_matrix, parts, raise, unmasked, whole};
 use crate::error::Error;
 use crate::phase::{
     Compensation, FringeSet, PhaseError, error_of_harmonics, harmonics_of_gamma as harmonics_of_gamma_core,
@@ -15,22 +15,22 @@ use crate::phase::{
 #[pyclass(frozen, get_all, module = "weldscan", name = "PhaseError")]
 pub(crate) struct PyPhaseError {
     /// N.
-    steps: usize,
+    pub(super) steps: usize,
     /// Coefficients, rad; all zero where nothing was seen.
-    sin_rad: Vec<f64>,
+    pub(super) sin_rad: Vec<f64>,
     /// Their standard deviations, rad; zero where they were given or computed.
-    standard_rad: Vec<f64>,
+    pub(super) standard_rad: Vec<f64>,
     /// What it is known from: "phase", "finer set" (this one's waves are too long to be seen against the surface),
     /// "given", "nothing" (no error above the noise).
-    source: &'static str,
+    pub(super) source: String,
     /// The largest error of a phase, rad.
-    largest_rad: f64,
+    pub(super) largest_rad: f64,
 }
 
 #[pymethods]
 impl PyPhaseError {
     fn __repr__(&self) -> String {
-        let (n, largest, source) = (self.steps, self.largest_rad, self.source);
+        let (n, largest, source) = (self.steps, self.largest_rad, &self.source);
         format!("PhaseError({n} steps, up to {largest:.4} rad, from {source})")
     }
 }
@@ -41,7 +41,7 @@ impl From<&PhaseError> for PyPhaseError {
             steps: e.steps,
             sin_rad: e.sin_rad.to_vec(),
             standard_rad: e.standard_rad.to_vec(),
-            source: e.source.name(),
+            source: e.source.name().into(),
             largest_rad: e.largest_rad(),
         }
     }
@@ -58,6 +58,7 @@ pub(super) fn compensation(
         raise(py, &Error::Shape { what: "phase_error", expected, got })
     };
     let Some(given) = given else { return Ok(Compensation::Off) };
+    unmasked("phase_error", given)?;
     if let Ok(word) = given.extract::<String>() {
         return if word == "auto" { Ok(Compensation::Auto) } else { Err(wrong(format!("{word:?}"))) };
     }

@@ -1,6 +1,6 @@
 //! Camera, projector and scanner as Python sees them.
 
-use numpy::{IntoPyArray, PyArray2, PyArrayMethods, PyUntypedArrayMethods};
+use numpy::{IntoPyArray, IxDyn, PyArray2, PyArrayMethods, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
 use super::{compute, float_matrix, floats, raise, transform, whole};
@@ -12,7 +12,7 @@ use crate::scanner::{Lens, Scanner};
 /// Args:
 ///     width, height: the image, px.
 ///     K: (3, 3) `[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`, px; the centre of the first pixel is (0, 0). No skew.
-///     dist: k1, k2, p1, p2 and, if there is a fifth, k3.
+///     dist: k1, k2, p1, p2 and, if there is a fifth, k3; (n,), or (1, n) or (n, 1), as OpenCV has them.
 ///
 /// Raises:
 ///     InputError: a wrong shape, a value that is not finite, a focal length that is not above zero, a skew.
@@ -51,7 +51,11 @@ impl PyLens {
             let expected = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not modelled".into();
             return Err(raise(py, &Error::OutOfRange { what: "K", expected, value: k.to_string().replace('\n', "") }));
         }
-        let numbers = floats::<numpy::ndarray::Ix1>("dist", dist)?;
+        let numbers = floats::<IxDyn>("dist", dist)?;
+        // OpenCV's own are of one row, or of one column.
+        if numbers.shape().iter().filter(|&&side| side != 1).count() > 1 {
+            return Err(shape("dist", "numbers in a row or a column", format!("shape {:?}", numbers.shape())));
+        }
         let numbers = numbers.as_slice()?;
         let mut dist = [0.0; 5];
         match numbers.len() {

@@ -18,7 +18,7 @@ use crate::step::{self, Known, Shot};
 
 /// One part shot, cut into reference wall, other wall and bead (see `segment_weld`).
 #[pyclass(frozen, module = "weldscan")]
-pub(super) struct WeldShot(Segmentation);
+pub(super) struct WeldShot(pub(super) Segmentation);
 
 #[pymethods]
 impl WeldShot {

@@ -8,7 +8,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use super::scanner::PyScanner;
-use super::{Whole, compute, float_matrix, floats, parts, raise, raise_as, transform, whole};
+use super::{Whole, compute, float_matrix, floats, numbers, parts, raise, raise_as, transform, unmasked, whole};
 use crate::error::Error;
 use crate::scanner::Rays;
 use crate::simulate::scene;
@@ -126,16 +126,16 @@ fn wrong_object(py: Python<'_>, what: &str, error: PyErr) -> PyErr {
 /// One simulated shot: its images, and what each pixel's centre saw.
 #[pyclass(frozen, module = "weldscan", name = "SimulatedShot")]
 pub(crate) struct PyShot {
-    height: usize,
-    width: usize,
-    shot: Shot,
-    rays: Arc<Rays>,
+    pub(super) height: usize,
+    pub(super) width: usize,
+    pub(super) shot: Shot,
+    pub(super) rays: Arc<Rays>,
     /// Per exposure the image under even light, (H, W) uint8 or uint16.
     #[pyo3(get)]
-    white: Vec<Py<PyAny>>,
+    pub(super) white: Vec<Py<PyAny>>,
     /// Exposures of frames: `frames[e][i]` is frame i, in the order of the fringes and their steps.
     #[pyo3(get)]
-    frames: Vec<Vec<Py<PyAny>>>,
+    pub(super) frames: Vec<Vec<Py<PyAny>>>,
 }
 
 impl PyShot {
@@ -202,11 +202,13 @@ impl PyShot {
     #[pyo3(signature = (picture, *, exposure=1.0, number=0))]
     fn capture(
         &self,
-        picture: PyReadonlyArray2<'_, u8>,
+        picture: &Bound<'_, PyAny>,
         exposure: f64,
         #[pyo3(from_py_with = whole)] number: usize,
     ) -> PyResult<Py<PyAny>> {
         let py = picture.py();
+        unmasked("picture", picture)?;
+        let picture: PyReadonlyArray2<'_, u8> = picture.extract()?;
         let number = u32::try_from(number).map_err(|_| {
             let expected = "0 to 2^32 - 1".into();
             raise(py, &Error::OutOfRange { what: "number", expected, value: number.to_string() })
@@ -259,7 +261,7 @@ enum Fringe {
 ///     >>> float(round(np.nanmin(shot.points_mm[..., 2]), 3))
 ///     410.0
 #[pyfunction]
-#[pyo3(signature = (scanner, scene_from_scanner, bodies, fringes, photometry, *, exposures=vec![1.0], seed=0))]
+#[pyo3(signature = (scanner, scene_from_scanner, bodies, fringes, photometry, *, exposures=None, seed=0))]
 #[allow(clippy::too_many_arguments)] // They are what a shot depends on.
 fn simulate_shot(
     scanner: &Bound<'_, PyScanner>,
@@ -267,10 +269,11 @@ fn simulate_shot(
     bodies: Vec<Bound<'_, PyAny>>,
     fringes: &Bound<'_, PyAny>,
     photometry: &Bound<'_, PyAny>,
-    exposures: Vec<f64>,
+    exposures: Option<&Bound<'_, PyAny>>,
     #[pyo3(from_py_with = whole)] seed: usize,
 ) -> PyResult<PyShot> {
     let py = scanner.py();
+    let exposures = exposures.map_or(Ok(vec![1.0]), |e| numbers("exposures", e))?;
     let pose: Transform = transform("scene_from_scanner", &float_matrix("scene_from_scanner", scene_from_scanner)?)?;
     let bodies = bodies
         .iter()
@@ -572,15 +575,18 @@ impl From<PyScene> for scene::Scene {
 #[pyclass(frozen, module = "weldscan._weldcore", name = "WeldSurface")]
 pub(crate) struct PyWeldSurface {
     surface: scene::Surface,
+    /// What it is pickled as.
+    pub(super) weld: Py<PyAny>,
 }
 
 #[pymethods]
 impl PyWeldSurface {
     #[new]
-    fn new(weld: &Bound<'_, PyAny>) -> PyResult<Self> {
+    pub(super) fn new(weld: &Bound<'_, PyAny>) -> PyResult<Self> {
         let py = weld.py();
         let given: PyScene = weld.extract().map_err(|e| wrong_object(py, "weld", e))?;
-        Ok(Self { surface: compute(py, || scene::Surface::new(given.into()))? })
+        let surface = compute(py, || scene::Surface::new(given.into()))?;
+        Ok(Self { surface, weld: weld.clone().unbind() })
     }
 
     /// Height of the surface over the nominal radius.

@@ -15,10 +15,10 @@ pub(crate) fn rows<'py>(py: Python<'py>, transform: &Transform) -> Bound<'py, Py
 /// rms distance that remains.
 #[pyclass(frozen, module = "weldscan", name = "RigidFit")]
 pub(crate) struct PyRigidFit {
-    fit: Transform,
+    pub(super) fit: Transform,
     /// The weighted rms of the distances that remain, mm.
     #[pyo3(get)]
-    rms_mm: f64,
+    pub(super) rms_mm: f64,
 }
 
 #[pymethods]

@@ -5,7 +5,7 @@ use pyo3::prelude::*;
 
 use super::phase::image;
 use super::scanner::PyScanner;
-use super::{compute, float_matrix, raise};
+use super::{compute, float_matrix, numbers, raise, unmasked};
 use crate::error::Error;
 use crate::triangulate::{
     Axis, ReferenceGeometry, ReferencePlane, calibrate_reference_plane as calibrate_core, height_from_calibration,
@@ -16,10 +16,10 @@ use crate::triangulate::{
 #[pyclass(frozen, get_all, module = "weldscan", name = "Cloud")]
 pub(crate) struct PyCloud {
     /// (H, W, 3) float64, mm, scanner frame; NaN where there is no point.
-    points_mm: Py<PyArray3<f64>>,
+    pub(super) points_mm: Py<PyArray3<f64>>,
     /// (H, W) float32, mm: standard deviation along the camera's ray, NaN where there is no point; None if no sigma_px
     /// was given.
-    sigma_mm: Option<Py<PyArray2<f32>>>,
+    pub(super) sigma_mm: Option<Py<PyArray2<f32>>>,
 }
 
 #[pymethods]
@@ -90,6 +90,7 @@ fn triangulate(
     same_size("column", column.shape())?;
     let sigma: Option<PyReadonlyArray2<'_, f32>> = match sigma_px {
         Some(given) => {
+            unmasked("sigma_px", given)?;
             let array = py.import("numpy")?.call_method1("ascontiguousarray", (given, "float32"));
             let array = array.ok().and_then(|a| a.cast_into::<PyArray2<f32>>().ok()).ok_or_else(|| {
                 let got = given.get_type().to_string();
@@ -111,11 +112,11 @@ fn triangulate(
 #[pyclass(frozen, get_all, module = "weldscan", name = "ReferencePlane")]
 pub(crate) struct PyReferencePlane {
     /// (H, W) float64, 1/mm. In the paper's geometry 1/distance.
-    a: Py<PyArray2<f64>>,
+    pub(super) a: Py<PyArray2<f64>>,
     /// (H, W) float64, rad/mm. In the paper's geometry 2 pi baseline/(distance period).
-    b: Py<PyArray2<f64>>,
+    pub(super) b: Py<PyArray2<f64>>,
     /// (H, W) float32, mm: root mean square error of the calibration heights.
-    rms_mm: Py<PyArray2<f32>>,
+    pub(super) rms_mm: Py<PyArray2<f32>>,
 }
 
 #[pymethods]
@@ -151,11 +152,13 @@ impl PyReferencePlane {
 fn calibrate_reference_plane(
     reference_phase: &Bound<'_, PyAny>,
     phases: &Bound<'_, PyAny>,
-    heights_mm: Vec<f64>,
+    heights_mm: &Bound<'_, PyAny>,
 ) -> PyResult<PyReferencePlane> {
     let py = reference_phase.py();
     let reference = float_matrix("reference_phase", reference_phase)?;
     let shape = reference.shape().to_vec();
+    let heights_mm = numbers("heights_mm", heights_mm)?;
+    unmasked("phases", phases)?;
     let planes = phases.try_iter()?.map(|p| float_matrix("phases", &p?)).collect::<PyResult<Vec<_>>>()?;
     if let Some(plane) = planes.iter().find(|p| p.shape() != shape) {
         let (expected, got) = (format!("the shape of reference_phase, {shape:?}"), format!("{:?}", plane.shape()));

@@ -456,7 +456,7 @@ impl<'a> View<'a> {
             station.wall_step_mm = Some(b - a);
         }
         for side in 0..2 {
-            station.departure_mm[side] = self.departure(k, &station, side);
+            station.departure_mm[side] = self.departure(k, &station, &toes, side);
         }
         let (edge, height) = self.edge(k, found, &station, &toes);
         station.edge = edge;
@@ -464,12 +464,13 @@ impl<'a> View<'a> {
         station
     }
 
-    /// Largest departure of the transition from the straight wall, over blocks of bins.
-    fn departure(&self, k: usize, station: &Station, side: usize) -> f64 {
-        let (Some(run), Some(toes)) = (station.walls[side], station.toes_mm) else { return 0.0 };
+    /// Largest departure of the transition from the straight wall, over blocks of bins. What may as well be the cap's
+    /// flank is no transition: the edges' hull bears it.
+    fn departure(&self, k: usize, station: &Station, toes: &[Toe; 2], side: usize) -> f64 {
+        let Some(run) = station.walls[side] else { return 0.0 };
         let profile = &self.smooth[k][side];
-        let toe = if side == 0 { -toes[0] } else { toes[1] };
-        let (from, to) = (profile.boundary(toe + 1.0), profile.boundary(run.from));
+        let [at, last] = if side == 0 { [-toes[0].at, -toes[0].from] } else { [toes[1].at, toes[1].to] };
+        let (from, to) = (profile.boundary(last.max(at + 1.0)), profile.boundary(run.from));
         let block = profile.in_bins(1.0);
         (from..to)
             .step_by(block)

@@ -43,8 +43,8 @@ pub(crate) struct WallRun {
     pub rms: f64,
     /// Standard uncertainty of the slope.
     pub slope_u: f64,
-    centre: f64,
-    shell_mm: [f64; 2],
+    pub(crate) centre: f64,
+    pub(crate) shell_mm: [f64; 2],
 }
 
 impl WallRun {

@@ -17,14 +17,15 @@ mod shapes;
 mod weld;
 
 use std::f64::consts::TAU;
-use std::sync::OnceLock;
 
 use rayon::prelude::*;
 
 use crate::Vec3;
 use crate::error::{Error, Result, require_positive};
+use crate::memory::require;
 use crate::scanner::{Lens, Scanner};
-use crate::threads;
+use crate::stop::polled;
+use crate::threads::{self, Lasting};
 use crate::transform::Transform;
 
 pub use shapes::{Body, Hit, Ray, Shape, Surface};
@@ -105,9 +106,9 @@ pub struct Sample {
     /// Its angle about the axis, rad (plates: place along the seam, mm), for walls in the light; NaN elsewhere.
     pub along: f64,
     /// Light from the projector at exposure 1 where the pattern is white.
-    direct: f32,
+    pub(crate) direct: f32,
     /// Light from the room at exposure 1.
-    ambient: f32,
+    pub(crate) ambient: f32,
     /// Label of the body, 0 for the background.
     pub label: u8,
 }
@@ -140,9 +141,9 @@ pub struct Shot {
     /// The truth, per pixel.
     pub samples: Vec<Sample>,
     /// The rays of pixels on edges.
-    edges: Vec<(usize, [Sample; 4])>,
-    photometry: Photometry,
-    projector: Lens,
+    pub(crate) edges: Vec<(usize, [Sample; 4])>,
+    pub(crate) photometry: Photometry,
+    pub(crate) projector: Lens,
 }
 
 impl Shot {
@@ -158,6 +159,7 @@ impl Shot {
             let (expected, got) = (format!("{height} x {width} pixels"), format!("{} pixels", picture.len()));
             return Err(Error::Shape { what: "picture", expected, got });
         }
+        require(self.samples.len() + picture.len(), 24);
         let light = Light::of(picture, width, height, &self.photometry);
         let value = |s: &Sample| s.direct * light.at(s.column_px, s.row_px) + s.ambient;
         let mut signal: Vec<f32> =
@@ -225,7 +227,7 @@ fn blur(image: &[f32], width: usize, sigma_px: f64) -> Vec<f32> {
         let at = |i: usize| row.get(i.saturating_sub(reach).min(row.len() - 1)).copied().unwrap_or(0.0);
         (0..row.len()).map(|u| weights.iter().enumerate().map(|(k, w)| w * at(u + k)).sum()).collect()
     };
-    threads::install(|| image.par_chunks(width).flat_map_iter(row).collect())
+    threads::install(|| image.par_chunks(width).inspect(polled).flat_map_iter(row).collect())
 }
 
 fn transpose(image: &[f32], width: usize) -> Vec<f32> {
@@ -249,13 +251,16 @@ pub fn simulate(
     let view = View::new(scanner, scene_from_scanner, bodies, photometry);
     let rays = scanner.camera_rays();
     let (width, height) = (scanner.camera.width, scanner.camera.height);
+    let frames = exposures.len() * (1 + fringes.iter().map(|f| f.steps).sum::<usize>());
+    require(width * height, 3 * size_of::<Sample>() + frames * if photometry.bits == 8 { 1 } else { 2 });
     let row = |v: usize| {
         let pixels = v * width..(v + 1) * width;
         let directions = rays.x.get(pixels.clone()).into_iter().flatten().zip(rays.y.get(pixels).into_iter().flatten());
         directions.map(|(&x, &y)| view.sample(x, y)).collect::<Vec<_>>()
     };
-    let samples: Vec<Sample> =
-        threads::install(|| (0..height).into_par_iter().with_min_len(BAND).flat_map_iter(row).collect());
+    let samples: Vec<Sample> = threads::install(|| {
+        (0..height).into_par_iter().with_min_len(BAND).inspect(polled).flat_map_iter(row).collect()
+    });
     let edges = antialias(scanner, &view, &samples);
     let shader = Shader { scanner, fringes, exposures, photometry, samples: &samples, edges: &edges };
     let frames = if photometry.bits == 8 { Frames::Eight(shader.render()) } else { Frames::Sixteen(shader.render()) };
@@ -441,7 +446,9 @@ fn antialias(scanner: &Scanner, view: &View<'_>, samples: &[Sample]) -> Vec<(usi
             (v * camera.width + u, rays.map(cast))
         })
     };
-    threads::install(|| (0..camera.height).into_par_iter().with_min_len(BAND).flat_map_iter(row).collect())
+    threads::install(|| {
+        (0..camera.height).into_par_iter().with_min_len(BAND).inspect(polled).flat_map_iter(row).collect()
+    })
 }
 
 /// A sensor's number.
@@ -491,7 +498,11 @@ impl Shader<'_> {
         }
         let light: Vec<Vec<f32>> = self.fringes.iter().map(|f| self.light(f)).collect();
         threads::install(|| {
-            bands.into_par_iter().enumerate().for_each(|(i, parts)| self.render_band(i * band, parts, &light));
+            bands
+                .into_par_iter()
+                .inspect(polled)
+                .enumerate()
+                .for_each(|(i, parts)| self.render_band(i * band, parts, &light));
         });
         frames
     }
@@ -667,8 +678,8 @@ impl Normals {
 }
 
 fn normals() -> &'static Normals {
-    static TABLE: OnceLock<Normals> = OnceLock::new();
-    TABLE.get_or_init(Normals::tabulate)
+    static TABLE: Lasting<Normals> = Lasting::new();
+    TABLE.get(Normals::tabulate)
 }
 
 #[cfg(test)]

@@ -5,7 +5,9 @@ use std::f64::consts::{FRAC_PI_2, TAU};
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
+use crate::memory::require;
 use crate::statistics::median;
+use crate::stop::polled;
 use crate::threads::{self, CHUNK};
 
 /// What the bit images are compared with.
@@ -120,9 +122,10 @@ pub fn decode_gray<T: Copy + Into<f64> + Sync>(
         }
         binary
     };
+    require(n, 4);
     let mut out = vec![0; n];
     threads::install(|| {
-        out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, values)| {
+        out.par_chunks_mut(CHUNK).inspect(polled).enumerate().for_each(|(chunk, values)| {
             values.iter_mut().enumerate().for_each(|(i, v)| *v = code(chunk * CHUNK + i));
         });
     });
@@ -155,6 +158,7 @@ pub fn absolute_from_gray(code: &[i32], wrapped: &[f64]) -> Result<Vec<f64>> {
         };
         phase + TAU * f64::from(order)
     };
+    require(code.len(), 8);
     Ok(code.iter().zip(wrapped).map(absolute).collect())
 }
 

@@ -19,7 +19,9 @@ pub use gray::{GrayImages, absolute_from_gray, decode_gray};
 pub use spatial::unwrap_spatial;
 
 use crate::error::{Error, Result};
+use crate::memory::require;
 use crate::phase::round64;
+use crate::stop::polled;
 use crate::threads::{self, CHUNK};
 
 /// The least phase noise that is worth planning for, rad: 8-bit images at full modulation (B = 100, one grey level of
@@ -235,9 +237,10 @@ pub fn unwrap_temporal(wrapped: &[&[f64]], periods: &[f64], z: f64) -> Result<Ve
         }
         own + TAU * order
     };
+    require(n, 8);
     let mut out = vec![0.0; n];
     threads::install(|| {
-        out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, values): (usize, &mut [f64])| {
+        out.par_chunks_mut(CHUNK).inspect(polled).enumerate().for_each(|(chunk, values): (usize, &mut [f64])| {
             values.iter_mut().enumerate().for_each(|(i, v)| *v = absolute(chunk * CHUNK + i));
         });
     });

@@ -12,7 +12,9 @@ use std::f64::consts::TAU;
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
+use crate::memory::require;
 use crate::phase::{round, round64};
+use crate::stop::{poll, polled};
 use crate::threads::{self, CHUNK};
 
 /// Side of a tile, pixels.
@@ -209,6 +211,7 @@ pub fn unwrap_spatial(
     if n == 0 {
         return Ok(Vec::new());
     }
+    require(n, 120);
     let whole = |v: f64| round64(v / TAU);
     let turns = |i: usize| -> f32 {
         let value = wrapped.get(i).copied().unwrap_or(f64::NAN);
@@ -229,13 +232,15 @@ pub fn unwrap_spatial(
 
     let corners: Vec<(usize, usize)> =
         (0..height).step_by(SIDE).flat_map(|top| (0..width).step_by(SIDE).map(move |left| (left, top))).collect();
-    let tiles: Vec<Tile> =
-        threads::install(|| corners.into_par_iter().map(|(left, top)| join_tile(&image, left, top)).collect());
+    let tiles: Vec<Tile> = threads::install(|| {
+        corners.into_par_iter().inspect(polled).map(|(left, top)| join_tile(&image, left, top)).collect()
+    });
 
     // Second round: the groups of all tiles, and the joints that wait.
     let mut group = vec![(0u32, 0i32); n];
     let mut waiting = Vec::new();
     for tile in &tiles {
+        poll();
         for (y, row) in tile.group.chunks(tile.width).enumerate().take(tile.height) {
             let start = (tile.top + y) * width + tile.left;
             group[start..start + tile.width].copy_from_slice(row);
@@ -244,7 +249,10 @@ pub fn unwrap_spatial(
     }
     waiting.sort_unstable();
     let mut groups = Groups::new(n);
-    for joint in waiting {
+    for (number, joint) in waiting.into_iter().enumerate() {
+        if number.is_multiple_of(CHUNK) {
+            poll();
+        }
         let (a, b) = image.ends(joint);
         let ((la, ta), (lb, tb)) = (group[a], group[b]);
         let ((ga, ua), (gb, ub)) = (groups.find(la as usize), groups.find(lb as usize));
@@ -269,7 +277,7 @@ pub fn unwrap_spatial(
     };
     let mut out = vec![0.0; n];
     threads::install(|| {
-        out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, values): (usize, &mut [f64])| {
+        out.par_chunks_mut(CHUNK).inspect(polled).enumerate().for_each(|(chunk, values): (usize, &mut [f64])| {
             values.iter_mut().enumerate().for_each(|(i, v)| *v = answer(chunk * CHUNK + i));
         });
     });
@@ -287,7 +295,7 @@ fn roughness(phase: &[f32], width: usize) -> Vec<f32> {
         bend(above, here, below, &mut out);
         out
     };
-    let rows: Vec<Vec<f32>> = threads::install(|| (0..height).into_par_iter().map(row).collect());
+    let rows: Vec<Vec<f32>> = threads::install(|| (0..height).into_par_iter().inspect(polled).map(row).collect());
     rows.concat()
 }
 

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from weldscan._weldcore import __version__
+from weldscan._weldcore import __version__, set_threads
 from weldscan.faces.cli import boundary, calibrate, inspect, station, validate, verify
 
 app = typer.Typer(
@@ -39,6 +39,8 @@ def _options(
     ] = False,
 ) -> None:
     """Measures the edge displacement (hi-lo) of butt welds from structured-light scans, with U and a verdict."""
+    # A number of threads that is none is said before anything is read.
+    set_threads()
 
 
 for commands in (inspect, validate, verify, calibrate, station):

@@ -9,7 +9,8 @@ use rayon::prelude::*;
 use crate::Vec3;
 use crate::error::{Error, Result};
 use crate::fit::principal;
-use crate::threads;
+use crate::stop::{poll, polled};
+use crate::threads::{self, CHUNK};
 
 /// A small patch of the cloud.
 #[derive(Debug, Clone, Copy, Default)]
@@ -69,7 +70,12 @@ impl<'a> Cloud<'a> {
         let (tile, side) = tile_size(points, width, radius);
         let columns = width.div_ceil(tile);
         let rows: Vec<std::result::Result<Vec<Cell>, usize>> = threads::install(|| {
-            points.par_chunks(width * tile).enumerate().map(|(r, band)| band_cells(band, width, tile, r)).collect()
+            points
+                .par_chunks(width * tile)
+                .inspect(polled)
+                .enumerate()
+                .map(|(r, band)| band_cells(band, width, tile, r))
+                .collect()
         });
         let mut cells = Vec::with_capacity(rows.len() * columns);
         for row in rows {
@@ -84,8 +90,9 @@ impl<'a> Cloud<'a> {
         let mut size = radius / 8.0;
         loop {
             let voxels = Voxels::of(points, size);
-            let merged: Vec<Sums> =
-                threads::install(|| (0..voxels.keys.len()).into_par_iter().map(|i| voxels.merged(i)).collect());
+            let merged: Vec<Sums> = threads::install(|| {
+                (0..voxels.keys.len()).into_par_iter().inspect(polled).map(|i| voxels.merged(i)).collect()
+            });
             // As a typical point sees it: strays fill many voxels.
             let mut counts: Vec<(f64, f64)> = merged.iter().zip(&voxels.sums).map(|(m, s)| (m.n, s.n)).collect();
             counts.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
@@ -304,7 +311,10 @@ impl Voxels {
         let mut table = Table::default();
         let (mut keys, mut sums): (Vec<Key>, Vec<Sums>) = (Vec::new(), Vec::new());
         let mut of_point = Vec::with_capacity(points.len());
-        for p in points {
+        for (i, p) in points.iter().enumerate() {
+            if i.is_multiple_of(CHUNK) {
+                poll();
+            }
             let q = Vec3::from(*p) - origin;
             let k = key(&q, size);
             let id = *table.entry(k).or_insert_with(|| {

@@ -82,6 +82,7 @@ pub fn find(points: &[[f64; 3]], width: Option<usize>, radius_mm: f64, count: Op
     if count == Some(0) {
         return Err(Error::OutOfRange { what: "count", expected: "at least 1".into(), value: "0".into() });
     }
+    crate::memory::require(points.len(), 64);
     let cloud = match width {
         Some(width) => Cloud::of_grid(points, width, radius_mm)?,
         None => {
@@ -111,6 +112,7 @@ impl Cloud<'_> {
         let plane = std::f64::consts::PI * (BALL * radius / self.side).powi(2);
         let enough = (ABOVE_PLANE * plane).max(4.0);
         for peak in votes.peaks().into_iter().take(MAX_PEAKS) {
+            crate::stop::poll();
             if looked.len() >= MAX_PLACES {
                 break;
             }
@@ -154,6 +156,7 @@ impl Cloud<'_> {
         let mut zone: Vec<(usize, usize, f64)> = Vec::new();
         // Each round measures the noise, gates, fits; ten rounds settle or never will.
         for _ in 0..20 {
+            crate::stop::poll();
             zone.clear();
             for &(i, k) in &near {
                 let d = Vec3::from(self.points[i]) - center;

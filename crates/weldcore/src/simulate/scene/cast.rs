@@ -6,7 +6,9 @@ use rayon::prelude::*;
 
 use super::{Part, Surface};
 use crate::Vec3;
+use crate::memory::require;
 use crate::scanner::Scanner;
+use crate::stop::polled;
 use crate::threads;
 use crate::transform::Transform;
 
@@ -256,6 +258,7 @@ impl Surface {
 
     /// What every pixel of a scanner sees; `weld_from_scanner` is where it stands.
     pub fn cast(&self, scanner: &Scanner, weld_from_scanner: &Transform) -> Cast {
+        require(scanner.camera.width * scanner.camera.height, 3 * size_of::<Seen>());
         let rays = scanner.camera_rays();
         let (width, height) = (scanner.camera.width, scanner.camera.height);
         let projector_from_weld = (*weld_from_scanner * scanner.camera_from_projector).inverse();
@@ -280,6 +283,6 @@ impl Surface {
             };
             directions.map(see).collect::<Vec<_>>()
         };
-        threads::install(|| (0..height).into_par_iter().with_min_len(BAND).flat_map_iter(row).collect())
+        threads::install(|| (0..height).into_par_iter().with_min_len(BAND).inspect(polled).flat_map_iter(row).collect())
     }
 }

@@ -7,6 +7,8 @@ use rayon::prelude::*;
 
 use super::super::{mix, normals};
 use crate::error::{Error, Result};
+use crate::memory::require;
+use crate::stop::polled;
 use crate::threads;
 
 /// Nodes per correlation length: the spline then follows the field to a thousandth of its sd.
@@ -132,6 +134,7 @@ impl Field {
             let expected = format!("long enough for {MOST_NODES} nodes");
             return Err(Error::OutOfRange { what: "unevenness around_mm and along_mm", expected, value });
         }
+        require(around * (along + 64), 40);
         let per_rad = around as f64 / TAU;
         let ring = Kernel::new(of.around_mm * per_rad / radius_mm).normalised(around);
         let line = Kernel::new(of.along_mm * per_mm).normalised(0);
@@ -139,7 +142,8 @@ impl Field {
         let row = |i: usize| -> Vec<f64> {
             ring.closed(&(0..around).map(|j| noise(seed, i * around + j)).collect::<Vec<_>>())
         };
-        let rows: Vec<Vec<f64>> = threads::install(|| (0..along + 2 * line.reach).into_par_iter().map(row).collect());
+        let rows: Vec<Vec<f64>> =
+            threads::install(|| (0..along + 2 * line.reach).into_par_iter().inspect(polled).map(row).collect());
         let smooth = |i: usize| -> Vec<f64> {
             let mut sum = vec![0.0; around];
             for (tap, row) in line.taps.iter().zip(rows.iter().skip(i)) {
@@ -147,7 +151,8 @@ impl Field {
             }
             sum
         };
-        let nodes: Vec<Vec<f64>> = threads::install(|| (0..along).into_par_iter().map(smooth).collect());
+        let nodes: Vec<Vec<f64>> =
+            threads::install(|| (0..along).into_par_iter().inspect(polled).map(smooth).collect());
         Ok(Self { around, along, per_rad, per_mm, half_length_mm, nodes: nodes.concat() })
     }
 

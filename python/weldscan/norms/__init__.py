@@ -110,7 +110,7 @@ def load_norm(norm_id: str) -> tuple[Norm, str | None]:
 @cache
 def _norms() -> dict[str, Norm]:
     files = sorted(
-        (file for file in resources.files(__name__).iterdir() if file.name.endswith(".toml")),
+        (file for file in resources.files(__name__).joinpath("data").iterdir() if file.name.endswith(".toml")),
         key=lambda file: file.name,
     )
     return {norm.id: norm for norm in (_read(file.read_text(encoding="utf-8")) for file in files)}

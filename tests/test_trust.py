@@ -19,7 +19,7 @@ MUST_NOT_PASS = {
     "hard-taper": {"transition"},
     "hard-flare": {"transition", "edges"},
     "hard-dent": {"transition"},
-    "hard-narrow": {"coverage", "transition"},
+    "hard-narrow": {"transition"},
     "hard-dark-arc": {"coverage"},
     "hard-two-pipes": {"shots-disagree"},
 }

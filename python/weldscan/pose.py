@@ -39,6 +39,7 @@ def matrix_from_kuka(x_mm: float, y_mm: float, z_mm: float, a_deg: float, b_deg:
 
     Raises `InputError` for a number that is not finite. Source: KUKA System Software, R = Rz(A) Ry(B) Rx(C).
 
+    >>> from weldscan import matrix_from_kuka
     >>> matrix_from_kuka(0, 0, 0, 90, 0, 0).round(6)[0, 1]
     np.float64(-1.0)
     """
@@ -64,6 +65,7 @@ def kuka_from_matrix(matrix: ArrayLike) -> tuple[float, float, float, float, flo
     as the controller does it; the rotation is then within 1e-6 rad of the matrix. Raises `InputError` for what is not a
     rigid transform.
 
+    >>> from weldscan import kuka_from_matrix, matrix_from_kuka
     >>> kuka_from_matrix(matrix_from_kuka(1, 2, 3, 40, 90, 30))[3:]
     (0.0, 90.0, -10.0)
     """
@@ -87,6 +89,7 @@ def kuka_from_matrix(matrix: ArrayLike) -> tuple[float, float, float, float, flo
 class KukaPose:
     """A pose as the controller gives it: mm and degrees.
 
+    >>> from weldscan import KukaPose
     >>> KukaPose(1, 2, 3, 0, 0, 0).matrix()[:3, 3]
     array([1., 2., 3.])
     """
@@ -122,6 +125,7 @@ def parse_e6pos(text: str) -> KukaPose:
 
     Raises `InputError` for anything else, and for external axes away from zero, which this project does not know.
 
+    >>> from weldscan import parse_e6pos
     >>> parse_e6pos("{E6POS: X 1.0, Y 2.0, Z 3.0, A 4.0, B 5.0, C 6.0, S 2, T 3, E1 0.0}").c_deg
     6.0
     """
@@ -131,6 +135,7 @@ def parse_e6pos(text: str) -> KukaPose:
 def parse_frame(text: str) -> KukaPose:
     """Return the pose in a FRAME string, such as the value of $TOOL or $BASE.
 
+    >>> from weldscan import parse_frame
     >>> parse_frame("{FRAME: X 0.0, Y 0.0, Z 120.5, A 0.0, B 0.0, C 0.0}").z_mm
     120.5
     """
@@ -140,6 +145,7 @@ def parse_frame(text: str) -> KukaPose:
 def parse_e6axis(text: str) -> tuple[float, float, float, float, float, float]:
     """Return A1 to A6, degrees, of an E6AXIS, E3AXIS or AXIS string.
 
+    >>> from weldscan import parse_e6axis
     >>> parse_e6axis("{E6AXIS: A1 0.0, A2 -90.0, A3 90.0, A4 0.0, A5 15.0, A6 0.0, E1 0.0}")[4]
     15.0
     """
@@ -150,6 +156,7 @@ def parse_e6axis(text: str) -> tuple[float, float, float, float, float, float]:
 def format_e6pos(pose: KukaPose) -> str:
     """Return the pose as an E6POS string with external axes at zero, for a controller to read.
 
+    >>> from weldscan import KukaPose, format_e6pos
     >>> format_e6pos(KukaPose(1, 2, 3, 4, 5, 6))[:38]
     '{E6POS: X 1.0, Y 2.0, Z 3.0, A 4.0, B '
     """
@@ -159,6 +166,7 @@ def format_e6pos(pose: KukaPose) -> str:
 def format_frame(pose: KukaPose) -> str:
     """Return the pose as a FRAME string.
 
+    >>> from weldscan import KukaPose, format_frame
     >>> format_frame(KukaPose(0, 0, 0, 0, 0, 0))
     '{FRAME: X 0.0, Y 0.0, Z 0.0, A 0.0, B 0.0, C 0.0}'
     """
@@ -168,6 +176,7 @@ def format_frame(pose: KukaPose) -> str:
 def format_e6axis(joints_deg: Iterable[float]) -> str:
     """Return six joint angles, degrees, as an E6AXIS string.
 
+    >>> from weldscan import format_e6axis
     >>> format_e6axis([0, -90, 90, 0, 0, 0])[:27]
     '{E6AXIS: A1 0.0, A2 -90.0, '
     """

@@ -368,7 +368,7 @@ def solve_hand_eye(
 
     Example:
         >>> import numpy as np
-        >>> from weldscan.calibration.artefact import PlateView
+        >>> from weldscan import PlateView, solve_hand_eye
         >>> plate = np.array([[-27.0, -24.0, 5.0], [25.0, -24.0, 7.0], [17.0, 19.0, 4.0]])
         >>> covariances = np.tile(np.eye(3) * 1e-4, (3, 1, 1))
         >>> view = PlateView("artefact-1", plate + [0, 0, 420], covariances, (0.01,) * 3, (9000,) * 3)

@@ -71,6 +71,7 @@ def probing_error(points_mm: ArrayLike, diameter_mm: float, share: float = 1.0) 
 
     Example:
         >>> import numpy as np
+        >>> from weldscan import probing_error
         >>> random = np.random.default_rng(1)
         >>> d = random.normal(size=(2000, 3)); d /= np.linalg.norm(d, axis=1)[:, None]
         >>> found = probing_error(10.005 * d, 20.0)
@@ -130,6 +131,7 @@ def flatness_error(points_mm: ArrayLike, share: float = 1.0) -> FormError:
 
     Example:
         >>> import numpy as np
+        >>> from weldscan import flatness_error
         >>> x, y = (each.ravel() for each in np.meshgrid(np.arange(21.0), np.arange(10.0)))
         >>> wave = 0.01 * np.cos(np.pi * x)
         >>> round(flatness_error(np.stack([x, y, 500 + wave], axis=1)).form_mm, 6)

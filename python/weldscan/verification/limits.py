@@ -35,6 +35,7 @@ class VerificationLimits(BaseModel):
     Lengths are in mm. A characteristic without a limit is measured and not judged.
 
     Example:
+        >>> from weldscan import VerificationLimits
         >>> limits = VerificationLimits(pf_mm=0.15, sd_mm=0.05)
         >>> limits.validity_days, limits.positions.sd
         (365, 7)
@@ -84,6 +85,7 @@ def read_limits(path: str | os.PathLike[str]) -> VerificationLimits:
 
     Example:
         >>> import pathlib, tempfile
+        >>> from weldscan import read_limits
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "limits.toml"
         >>> _ = path.write_text("pf_mm = 0.15\nsd_mm = 0.05\n")
         >>> read_limits(path).sd_mm

@@ -22,6 +22,7 @@ use crate::image::{self, Pixels};
 /// Example:
 ///     >>> import cv2, numpy as np
 ///     >>> data = cv2.imencode(".png", np.array([[1, 2, 3]], np.uint8))[1].tobytes()
+///     >>> from weldscan import decode_png
 ///     >>> decode_png(data)
 ///     array([[1, 2, 3]], dtype=uint8)
 ///     >>> decode_png(data[:-9])

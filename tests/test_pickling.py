@@ -22,7 +22,7 @@ import weldscan as ws
 from catalogue import JOBS, bits, fringes_on_a_wall, sphere_mesh
 from weldscan import _weldcore
 from weldscan.simulated import Body, Photometry, Sphere
-from weldscan.simulated.scenes import Weld
+from weldscan.simulated.scenes import SceneWeld
 
 SCALE = 0.02
 """A fiftieth of the catalogue's points and pixels."""
@@ -58,7 +58,7 @@ def examples() -> dict[type, Any]:
     things: list[Any] = [
         *(tree, ws.Follower(tree), lens, ws.Scanner(lens, lens, pose), ws.Mesh(*sphere_mesh(6))),
         *(ws.Plane([1, 2, 3], [1, 2, 3]), ws.Sphere([1, 2, 3], 4), ws.Cylinder([1, 2, 3], [1, 2, 2.5], 4)),
-        _weldcore.WeldSurface(Weld(315.0, 6.0)),
+        _weldcore.WeldSurface(SceneWeld(315.0, 6.0)),
     ]
     made = []
     for name, prepare in JOBS.items():

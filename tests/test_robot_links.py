@@ -17,7 +17,7 @@ from weldscan.devices.robots.rsi import RsiRobot, RsiSettings
 from weldscan.devices.robots.serial import SerialRobot, SerialSettings, cut_line
 from weldscan.devices.robots.wire import ConnectionLost, Link
 from weldscan.pose import format_frame
-from weldscan.simulated.controllers import Arm, Fault, TcpController
+from weldscan.simulated.controllers import Arm, LinkFault, TcpController
 from weldscan.simulated.controllers.eki import EkiController
 from weldscan.simulated.controllers.kinematics import ArmGeometry
 from weldscan.simulated.controllers.kvp import KvpController
@@ -216,7 +216,7 @@ def test_word_of_arrival_is_not_believed(cell, arm, monkeypatch):
 @moving_cells
 def test_stale_pose_is_no_arrival(cell, arm):
     controller, robot = cell
-    controller.inject(Fault.STALE, 100_000)
+    controller.inject(LinkFault.STALE, 100_000)
     with pytest.raises(DeviceTimeout):
         robot.move_to(NEAR)
 
@@ -287,10 +287,18 @@ def test_still(arm):
 
 # --- faults: every one ends in a typed error or a recovered pose, in time, and never in a wrong pose ------------------
 
-RECOVERED = (Fault.BYTES, Fault.TWICE, Fault.RESET, Fault.RESTART)
-TIMED_OUT = (Fault.SILENCE,)
-REFUSED = (Fault.WRONG_ID, Fault.WRONG_LENGTH, Fault.EMPTY, Fault.GARBAGE, Fault.HUGE, Fault.NAN, Fault.JUMP)
-XML_ONLY = (Fault.DTD, Fault.ENTITY)
+RECOVERED = (LinkFault.BYTES, LinkFault.TWICE, LinkFault.RESET, LinkFault.RESTART)
+TIMED_OUT = (LinkFault.SILENCE,)
+REFUSED = (
+    LinkFault.WRONG_ID,
+    LinkFault.WRONG_LENGTH,
+    LinkFault.EMPTY,
+    LinkFault.GARBAGE,
+    LinkFault.HUGE,
+    LinkFault.NAN,
+    LinkFault.JUMP,
+)
+XML_ONLY = (LinkFault.DTD, LinkFault.ENTITY)
 
 
 def reads_within(robot, seconds):
@@ -303,8 +311,8 @@ def reads_within(robot, seconds):
 
 def looks_unfinished(controller, fault):
     """Is more to be waited for, so that a time-out is the right answer?"""
-    return (isinstance(controller, KvpController) and fault is Fault.GARBAGE) or (
-        isinstance(controller, EkiController) and fault is Fault.WRONG_LENGTH
+    return (isinstance(controller, KvpController) and fault is LinkFault.GARBAGE) or (
+        isinstance(controller, EkiController) and fault is LinkFault.WRONG_LENGTH
     )
 
 
@@ -325,7 +333,7 @@ def test_recovers(cell, fault):
     controller, robot = cell
     controller.restart_s = 0.5
     controller.inject(fault)
-    if isinstance(controller, SerialController) and fault in (Fault.RESET, Fault.RESTART):
+    if isinstance(controller, SerialController) and fault in (LinkFault.RESET, LinkFault.RESTART):
         with pytest.raises(DeviceTimeout):  # a serial line knows no reset: half a reply is silence
             robot.pose()
     for _ in range(3):
@@ -348,14 +356,16 @@ def test_refused_and_then_right_again(cell, fault):
         assert not isinstance(caught.value, DeviceTimeout), caught.value
     assert robot.name in str(caught.value)
     controller._faults.clear()
-    if fault is Fault.JUMP:
+    if fault is LinkFault.JUMP:
         time.sleep(0.05)  # 400 mm back is a jump too, until there was time for it
-    if fault is Fault.HUGE and isinstance(controller, SerialController):
+    if fault is LinkFault.HUGE and isinstance(controller, SerialController):
         wait_for_quiet_line(robot)
     assert close_to(reads_within(robot, TIMEOUT_S), FLANGE)
 
 
-@pytest.mark.parametrize("fault", [Fault.GARBAGE, Fault.EMPTY, Fault.NAN, Fault.HUGE, Fault.DTD, Fault.ENTITY])
+@pytest.mark.parametrize(
+    "fault", [LinkFault.GARBAGE, LinkFault.EMPTY, LinkFault.NAN, LinkFault.HUGE, LinkFault.DTD, LinkFault.ENTITY]
+)
 def test_rsi_bad_packets(arm, fault):
     controller, robot = connect("rsi", arm)
     with controller, robot:
@@ -369,7 +379,7 @@ def test_rsi_bad_packets(arm, fault):
         assert close_to(reads_within(robot, TIMEOUT_S), FLANGE)
 
 
-@pytest.mark.parametrize("fault", [Fault.SILENCE, Fault.STALE])
+@pytest.mark.parametrize("fault", [LinkFault.SILENCE, LinkFault.STALE])
 def test_rsi_silence_and_a_stream_that_repeats_itself(arm, fault):
     controller, robot = connect("rsi", arm)
     with controller, robot:
@@ -384,10 +394,10 @@ def test_rsi_jump_and_restart(arm):
     controller, robot = connect("rsi", arm, timeout_s=2.0)
     with controller, robot:
         robot.pose()
-        controller.inject(Fault.RESTART)
+        controller.inject(LinkFault.RESTART)
         time.sleep(0.02)
         assert close_to(reads_within(robot, 2.0), FLANGE)
-        controller.inject(Fault.JUMP, 50)
+        controller.inject(LinkFault.JUMP, 50)
         with pytest.raises(DeviceError, match="jumped"):
             for _ in range(20):
                 robot.pose()
@@ -402,7 +412,7 @@ def test_rsi_listens_to_its_controller_alone(arm):
 def test_reset_is_a_reset():
     """Not an orderly end: what the client's socket says is ECONNRESET."""
     with KvpController(Arm(FLANGE)) as controller:
-        controller.inject(Fault.RESET)
+        controller.inject(LinkFault.RESET)
         with socket.create_connection(("127.0.0.1", controller.port), 2.0) as peer:
             peer.sendall(encode_request(1, READ, ["$POS_ACT"]))
             with pytest.raises(ConnectionResetError):
@@ -484,7 +494,7 @@ def test_serial_over_a_terminal_server(arm):
         url = f"socket://127.0.0.1:{server.port}"
         with SerialRobot(SerialSettings(port=url, timeout_s=TIMEOUT_S, reconnect_s=2.0)) as robot:
             assert close_to(robot.pose().flange, FLANGE)
-            server.inject(Fault.RESET)
+            server.inject(LinkFault.RESET)
             assert close_to(reads_within(robot, 2.0), FLANGE)
         server.close()
         with pytest.raises(DeviceError, match="cannot open"):

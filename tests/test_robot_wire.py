@@ -18,7 +18,7 @@ from weldscan.devices.robots.rsi import RsiRobot, RsiSettings
 from weldscan.devices.robots.rsi_answer import answer
 from weldscan.devices.robots.serial import checksum, cut_line, decode_line, encode_line
 from weldscan.devices.robots.wire import cut_xml, parse_xml
-from weldscan.simulated.controllers import Arm, Fault
+from weldscan.simulated.controllers import Arm, LinkFault
 from weldscan.simulated.controllers.eki import EkiController, EkiUdpController
 from weldscan.simulated.controllers.kvp import KvpController
 from weldscan.simulated.controllers.rsi import RsiController
@@ -389,4 +389,4 @@ def wait_for(condition, seconds=5.0):
 
 
 def test_every_fault_has_a_name():
-    assert {fault.value for fault in Fault} == {fault.name.lower().replace("_", "-") for fault in Fault}
+    assert {fault.value for fault in LinkFault} == {fault.name.lower().replace("_", "-") for fault in LinkFault}

@@ -26,7 +26,7 @@ from weldscan.devices.robots import distance
 from weldscan.records.frames import read_frames
 from weldscan.records.session import read_session
 from weldscan.records.shot import left_out
-from weldscan.simulated.controllers import Arm, Fault
+from weldscan.simulated.controllers import Arm, LinkFault
 from weldscan.simulated.controllers.kvp import KvpController
 from weldscan.station import check, store
 from weldscan.station import scan as scan_module
@@ -335,13 +335,15 @@ def test_a_robot_that_does_not_stand_still(cell):
     cell.assert_whole()
 
 
-@pytest.mark.parametrize("fault", [Fault.RESTART, Fault.RESET, Fault.BYTES, Fault.TWICE])
+@pytest.mark.parametrize("fault", [LinkFault.RESTART, LinkFault.RESET, LinkFault.BYTES, LinkFault.TWICE])
 def test_faults_that_a_scan_survives(cell, fault):
     assert cell.scan(tell=lambda what: cell.controller.inject(fault) if what.startswith("taking") else None).whole == 3
     cell.assert_whole()
 
 
-@pytest.mark.parametrize("fault", [Fault.SILENCE, Fault.GARBAGE, Fault.WRONG_ID, Fault.NAN, Fault.JUMP, Fault.EMPTY])
+@pytest.mark.parametrize(
+    "fault", [LinkFault.SILENCE, LinkFault.GARBAGE, LinkFault.WRONG_ID, LinkFault.NAN, LinkFault.JUMP, LinkFault.EMPTY]
+)
 def test_faults_that_stop_a_scan_which_then_goes_on(tmp_path, fault):
     cell = Cell(tmp_path, timeout_s=0.5)
     with cell.controller:

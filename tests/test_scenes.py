@@ -21,10 +21,10 @@ from weldscan.simulated.scenes import (
     Counterbore,
     Dent,
     Scene,
+    SceneWall,
+    SceneWeld,
     Taper,
-    Unevenness,
-    Wall,
-    Weld,
+    Waviness,
     draw,
     record,
     truth,
@@ -40,12 +40,12 @@ def with_weld(scene: Scene, **change) -> Scene:
 def plain() -> Scene:
     """A 219.1 x 8 pipe in two shots, nothing uneven."""
     scene = draw("plain", 4)
-    smooth = Weld(scene.welds[0].radius_mm, 8.0, half_length_mm=scene.welds[0].half_length_mm)
+    smooth = SceneWeld(scene.welds[0].radius_mm, 8.0, half_length_mm=scene.welds[0].half_length_mm)
     return replace(scene, welds=(smooth,), noise_mm=0.02)
 
 
 def test_the_truth_of_plain_walls_is_that_of_two_circles(plain):
-    moved = Wall(radius_difference_mm=0.3, offset_mm=(0.2, 0.0))
+    moved = SceneWall(radius_difference_mm=0.3, offset_mm=(0.2, 0.0))
     known = truth(with_weld(plain, other=moved))
     radius = plain.welds[0].radius_mm
     for degree, step in known["edge_step_by_deg"].items():
@@ -60,19 +60,21 @@ def test_the_truth_of_plain_walls_is_that_of_two_circles(plain):
 
 def test_the_truth_holds_what_was_done_to_the_edges(plain):
     middle = int(list(truth(plain)["edge_step_by_deg"])[10])
-    tapered = truth(with_weld(plain, other=Wall(taper=Taper(1.6, 0.1))))
+    tapered = truth(with_weld(plain, other=SceneWall(taper=Taper(1.6, 0.1))))
     assert set(tapered["edge_step_by_deg"].values()) == {-1.6} and not tapered["honest"]
-    bored = truth(with_weld(plain, reference=Wall(counterbore=Counterbore(0.7, 10.0))))
+    bored = truth(with_weld(plain, reference=SceneWall(counterbore=Counterbore(0.7, 10.0))))
     assert set(bored["edge_step_by_deg"].values()) == {0.7}
     dent = Dent(1.4, math.radians(middle), math.radians(4.0), 15.0)
-    dented = truth(with_weld(plain, other=Wall(dents=(dent,))))
+    dented = truth(with_weld(plain, other=SceneWall(dents=(dent,))))
     assert dented["largest"] == 1.4 and dented["largest_at_deg"] == middle
     assert dented["edge_step_by_deg"][str((middle + 2) % 360)] == pytest.approx(-0.7, abs=1e-4)
 
 
 def test_waves_and_shrinkage_are_in_the_truth(plain):
-    uneven = (Unevenness(0.02, 15.0, 40.0),)
-    scene = with_weld(plain, reference=Wall(unevenness=uneven), other=Wall(unevenness=uneven, shrinkage_mm=0.2))
+    uneven = (Waviness(0.02, 15.0, 40.0),)
+    scene = with_weld(
+        plain, reference=SceneWall(unevenness=uneven), other=SceneWall(unevenness=uneven, shrinkage_mm=0.2)
+    )
     known = truth(scene)
     steps = np.array(list(known["edge_step_by_deg"].values()))
     angle = np.radians([int(d) for d in known["edge_step_by_deg"]])
@@ -182,7 +184,7 @@ def test_images_give_the_points_back(tmp_path):
 
 
 def test_a_flat_calm_weld_is_measured_right(plain):
-    scene = with_weld(plain, other=Wall(offset_mm=(0.3, -0.2)), cap=Cap(9.0, 1.5))
+    scene = with_weld(plain, other=SceneWall(offset_mm=(0.3, -0.2)), cap=Cap(9.0, 1.5))
     weld, base = scene.welds[0], np.asarray(scene.base_from_weld)
     shots = []
     for shot in views(scene):
@@ -211,10 +213,10 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(InputError, match="kind: must be one of plain, oval"):
         draw("perfect", 0)
     with pytest.raises(InputError, match="scene radius_mm: must be finite and above 0"):
-        WeldSurface(Weld(-1.0, 6.0))
+        WeldSurface(SceneWeld(-1.0, 6.0))
     with pytest.raises(InputError, match="weld: "):
         WeldSurface("weld")
-    surface = WeldSurface(Weld(100.0, 6.0))
+    surface = WeldSurface(SceneWeld(100.0, 6.0))
     with pytest.raises(InputError, match="angle_rad: not finite at index 1"):
         surface.edges([0.0, math.nan])
     with pytest.raises(InputError, match="z_mm: expected 2 as angle_rad, got 1"):

@@ -101,7 +101,7 @@ class Features:
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class BundleModel:
     """The unknowns."""
 
     camera: Floats
@@ -118,9 +118,9 @@ class Model:
     shape: Floats
     """(P, 3), mm: by how much the board's features are off the drawing."""
 
-    def moved(self, step: Floats, pose_steps: Floats) -> Model:
+    def moved(self, step: Floats, pose_steps: Floats) -> BundleModel:
         """The model after a step of PARAMETERS and of the poses, (views, 6)."""
-        return Model(
+        return BundleModel(
             self.camera + step[CAMERA],
             self.projector + step[PROJECTOR],
             rotation(step[18:21]) @ self.turn,
@@ -130,7 +130,7 @@ class Model:
             self.shape,
         )
 
-    def of(self, views: Sequence[int]) -> Model:
+    def of(self, views: Sequence[int]) -> BundleModel:
         """The same with some of the poses."""
         return replace(self, turns=self.turns[list(views)], shifts=self.shifts[list(views)])
 
@@ -144,7 +144,7 @@ class Model:
 class Solution:
     """The adjusted model and how well it is known."""
 
-    model: Model
+    model: BundleModel
     covariance: Floats
     """(24, 24) of PARAMETERS; rows of what was held are zero."""
     camera_residual_px: Floats
@@ -244,7 +244,7 @@ class _Rows:
         )
 
 
-def rows_of(model: Model, f: Features) -> _Rows | None:
+def rows_of(model: BundleModel, f: Features) -> _Rows | None:
     """All residuals, in pixels, with r_p freed of the corner's error; None where a point is behind a device."""
     turns = model.turns[f.view]
     turned = np.einsum("nab,nb->na", turns, f.board_mm + model.shape[f.number])
@@ -282,7 +282,7 @@ def rows_of(model: Model, f: Features) -> _Rows | None:
 # --- the start --------------------------------------------------------------------------------------------------------
 
 
-def start(f: Features, camera_size: tuple[int, int], projector_size: tuple[int, int]) -> Model:
+def start(f: Features, camera_size: tuple[int, int], projector_size: tuple[int, int]) -> BundleModel:
     """From OpenCV: each device by itself with one radial term, then the median of their relations.
 
     Raises:
@@ -298,7 +298,9 @@ def start(f: Features, camera_size: tuple[int, int], projector_size: tuple[int, 
     u, _, vt = np.linalg.svd(np.sum(relations, axis=0))
     turn = np.asarray(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt)
     shift = np.median([shifts[i] - turn @ shifts_p[k] for k, i in enumerate(both)], axis=0)
-    return Model(camera, projector, turn, np.asarray(shift), turns, shifts, np.zeros((int(f.number.max()) + 1, 3)))
+    return BundleModel(
+        camera, projector, turn, np.asarray(shift), turns, shifts, np.zeros((int(f.number.max()) + 1, 3))
+    )
 
 
 def _device(f: Features, pixels: Floats, views: Sequence[int], size: tuple[int, int]) -> tuple[Floats, Floats, Floats]:
@@ -333,7 +335,7 @@ def _device(f: Features, pixels: Floats, views: Sequence[int], size: tuple[int, 
     return lens, turns, np.array([s.ravel() for s in shift], dtype=np.float64)
 
 
-def prior_sigmas(model: Model, camera_size: tuple[int, int], projector_size: tuple[int, int]) -> Floats:
+def prior_sigmas(model: BundleModel, camera_size: tuple[int, int], projector_size: tuple[int, int]) -> Floats:
     """The priors' widths: all of the focal length, the image's width, a tenth of it at its corner by distortion."""
     sigmas = np.empty(24)
     for part, lens, (width, height) in ((0, model.camera, camera_size), (9, model.projector, projector_size)):
@@ -358,7 +360,7 @@ class _Problem:
     """
 
     f: Features
-    centre: Model
+    centre: BundleModel
     prior: Floats
     """(24,) sigmas of PARAMETERS."""
     free: NDArray[np.intp]
@@ -384,19 +386,19 @@ class _Problem:
         kept = np.isin(self.f.view, list(views))
         return replace(self, f=self.f.of(views), centre=self.centre.of(views), inverse_sigma=self.inverse_sigma[kept])
 
-    def off(self, model: Model) -> tuple[Floats, Floats]:
+    def off(self, model: BundleModel) -> tuple[Floats, Floats]:
         """What the priors pull at: PARAMETERS but for turns, and places on the board."""
         out = np.zeros(24)
         out[CAMERA], out[PROJECTOR] = model.camera - self.centre.camera, model.projector - self.centre.projector
         out[21:24] = model.shift - self.centre.shift
         return out, model.shape - self.centre.shape
 
-    def prior_cost(self, model: Model) -> float:
+    def prior_cost(self, model: BundleModel) -> float:
         lenses, board = self.off(model)
         cost = float(np.square(lenses / self.prior).sum()) / 2
         return cost if self.board_sigma is None else cost + float(np.square(board / self.board_sigma).sum()) / 2
 
-    def moved(self, model: Model, core: Floats, blocks: Floats) -> Model:
+    def moved(self, model: BundleModel, core: Floats, blocks: Floats) -> BundleModel:
         """The model after a step."""
         if self.board_sigma is None:
             return model.moved(core, blocks)
@@ -425,7 +427,7 @@ def _summed(b: Floats, y: Floats) -> Floats:
     return np.asarray(np.moveaxis(b, 0, 1).reshape(size, count * own) @ y.reshape(count * own, -1))
 
 
-def _normal(p: _Problem, model: Model, rows: _Rows, weight: Floats, priors: bool = True) -> _Normal:
+def _normal(p: _Problem, model: BundleModel, rows: _Rows, weight: Floats, priors: bool = True) -> _Normal:
     """Weighted normal equations of the free unknowns."""
     root = np.sqrt(weight)[..., None]
     residuals = np.nan_to_num(rows.residuals) * root
@@ -475,7 +477,7 @@ def _step(p: _Problem, n: _Normal, damping: float) -> tuple[Floats, Floats, floa
 
 def solve(
     f: Features,
-    first: Model,
+    first: BundleModel,
     prior_sigma: Floats,
     *,
     k3: bool = False,
@@ -536,8 +538,8 @@ def _tukey(s: Floats) -> tuple[Floats, Floats]:
 
 
 def _minimise(
-    p: _Problem, model: Model, rows: _Rows, scales: Floats, robust: Callable[[Floats], tuple[Floats, Floats]]
-) -> tuple[Model, _Rows]:
+    p: _Problem, model: BundleModel, rows: _Rows, scales: Floats, robust: Callable[[Floats], tuple[Floats, Floats]]
+) -> tuple[BundleModel, _Rows]:
     """Levenberg-Marquardt at fixed scales."""
     inverse_scale, seen = p.inverse_sigma / scales, p.f.seen
 
@@ -573,7 +575,7 @@ def _minimise(
     return model, rows
 
 
-def _finish(p: _Problem, model: Model, rows: _Rows, scales: Floats) -> Solution:
+def _finish(p: _Problem, model: BundleModel, rows: _Rows, scales: Floats) -> Solution:
     """Covariance: the variance of each device from its residuals, its redundancy, and Tukey's loss of efficiency."""
     seen = p.f.seen
     s = np.linalg.norm(np.nan_to_num(rows.residuals), axis=2) * p.inverse_sigma / scales
@@ -645,7 +647,7 @@ def _trace(own: _Normal, whole: _Normal, inverse: Floats) -> float:
     return total - 2 * float(np.sum(np.swapaxes(own.b, 1, 2) * ys))
 
 
-def _without(p: _Problem, model: Model, rows: _Rows, weight: Floats) -> Floats:
+def _without(p: _Problem, model: BundleModel, rows: _Rows, weight: Floats) -> Floats:
     """One Newton step from the solution of all views to that of all but one, for each."""
     out = np.zeros((p.views, 24))
     for view in range(p.views) if p.views > LEAST_VIEWS else ():

@@ -93,7 +93,7 @@ def inverse(t: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class _HandEyeProblem:
     """The checked input."""
 
     names: tuple[str, ...]
@@ -133,7 +133,7 @@ def _moved(x: Floats, centres: Floats, step: Floats) -> tuple[Floats, Floats]:
     return out, centres + step[6:].reshape(3, 3)
 
 
-def _start(problem: _Problem, keep: Floats) -> tuple[Floats, Floats]:
+def _start(problem: _HandEyeProblem, keep: Floats) -> tuple[Floats, Floats]:
     """Closed forms: Horn's over all shots stacked; without touched centres linear in rotation, place and centres."""
     use = keep > 0
     poses, seen = problem.flange_from_base[use], problem.seen[use]
@@ -160,7 +160,7 @@ def _start(problem: _Problem, keep: Floats) -> tuple[Floats, Floats]:
     return x, np.asarray(solved[12:].reshape(3, 3) * scale, dtype=np.float64)
 
 
-def _least_squares(problem: _Problem, keep: Floats) -> tuple[Floats, Floats, Linear]:
+def _least_squares(problem: _HandEyeProblem, keep: Floats) -> tuple[Floats, Floats, Linear]:
     """Gauss-Newton with the stated noise."""
     x, centres = _start(problem, keep)
     stated = np.ones((1, FACTORS))
@@ -234,7 +234,7 @@ def _agreeing(linear: Linear) -> Floats:
     return keep
 
 
-def _fitted(problem: _Problem) -> _Found:
+def _fitted(problem: _HandEyeProblem) -> _Found:
     """All of it: start, outliers, the posterior of the rest, each shot against the others."""
     everyone = np.ones(len(problem.seen))
     x, centres, linear = _least_squares(problem, everyone)
@@ -254,7 +254,7 @@ def _fitted(problem: _Problem) -> _Found:
 
 def _problem(
     views: Sequence[PlateView], base_from_flange: Sequence[Floats], touched_mm: Floats | None, noise: Noise
-) -> _Problem:
+) -> _HandEyeProblem:
     """The input, checked: shapes, finite, rigid, no shot twice, spheres in order."""
     refuse_masked("views", [[view.centres_mm, view.covariances_mm2] for view in views])
     refuse_masked("base_from_flange", list(base_from_flange))
@@ -309,7 +309,7 @@ def _problem(
             f"artefact.centres_base: {names[0]}: the plate is mirrored: its spheres run the other way round than those "
             "in view"
         )
-    return _Problem(names, np.array([inverse(pose) for pose in poses]), seen, seen_cov, touched, noise)
+    return _HandEyeProblem(names, np.array([inverse(pose) for pose in poses]), seen, seen_cov, touched, noise)
 
 
 def tilts_rad(base_from_flange: Sequence[Floats]) -> tuple[float, float]:
@@ -453,7 +453,7 @@ def _undetermined(u_mm: float, turned: tuple[float, float]) -> GeometryError:
     )
 
 
-def _refuse_contradictions(problem: _Problem, found: _Found, base_from_flange: Sequence[Floats]) -> None:
+def _refuse_contradictions(problem: _HandEyeProblem, found: _Found, base_from_flange: Sequence[Floats]) -> None:
     sizes = np.sqrt(np.square(found.linear.residuals).sum(axis=-1).mean(axis=-1))
     rms = float(np.sqrt(np.square(sizes[found.keep > 0]).mean()))
     touched = problem.touched
@@ -484,7 +484,7 @@ def _refuse_contradictions(problem: _Problem, found: _Found, base_from_flange: S
         )
 
 
-def _why_outlier(problem: _Problem, found: _Found, i: int) -> str:
+def _why_outlier(problem: _HandEyeProblem, found: _Found, i: int) -> str:
     threshold = chi2_quantile(1 - OUTLIER_PROBABILITY / len(problem.names), 9)
     return (
         f"an outlier, not used: {found.left_out_mm[i]:.3f} mm off under the hand-eye of the other "
@@ -493,7 +493,7 @@ def _why_outlier(problem: _Problem, found: _Found, i: int) -> str:
     )
 
 
-def _warnings(problem: _Problem, found: _Found, result: HandEye) -> tuple[str, ...]:
+def _warnings(problem: _HandEyeProblem, found: _Found, result: HandEye) -> tuple[str, ...]:
     said = []
     used = int(found.keep.sum())
     if used == len(problem.names) and used > 1:

@@ -302,7 +302,7 @@ def _other_size(stack: Stack, board: Board) -> tuple[int, int] | None:
     return None
 
 
-def _without_bias(f: bundle.Features, views: Sequence[BoardView], model: bundle.Model) -> bundle.Features:
+def _without_bias(f: bundle.Features, views: Sequence[BoardView], model: bundle.BundleModel) -> bundle.Features:
     """Features moved from the centroids of imaged circles to the images of their centres (J. Heikkilä, TPAMI 22, 2000).
 
     The centroid of a circle's image is taken of its outline, a polygon of 64 corners seen through the lens.
@@ -514,7 +514,7 @@ def _coverage(pixels: Floats, size: tuple[int, int]) -> float:
 
 
 def _undetermined(
-    model: bundle.Model,
+    model: bundle.BundleModel,
     covariance: Floats,
     free: NDArray[np.intp],
     camera_size: tuple[int, int],

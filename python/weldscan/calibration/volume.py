@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from weldscan.calibration.bundle import (
     CAMERA,
     PROJECTOR,
+    BundleModel,
     Features,
-    Model,
     Solution,
     project,
     rigid,
@@ -31,7 +31,7 @@ AROUND_DEG = tuple(range(0, 360, 45))
 LEAST_IN_VIEW = 0.85
 
 
-def point_jacobian(model: Model, points: Floats, axis: str) -> Floats:
+def point_jacobian(model: BundleModel, points: Floats, axis: str) -> Floats:
     """How triangulated points (n, 3) move with PARAMETERS, (n, 3, 24): their pixel and projector column are as seen."""
     row = 0 if axis == "x" else 1
     n = len(points)
@@ -76,7 +76,7 @@ class Volume:
     )
 
 
-def volume_of(model: Model, f: Features, projector_size: tuple[int, int]) -> Volume:
+def volume_of(model: BundleModel, f: Features, projector_size: tuple[int, int]) -> Volume:
     """The volume that the boards filled: from the nearest to the furthest feature, as wide as the camera saw features.
 
     Corners are drawn in towards the middle until the projector sees them as well.
@@ -107,14 +107,14 @@ def _on_ray(lens: Floats, pixel: Floats, z: float) -> Floats:
     return np.asarray(point * z)
 
 
-def _in_image(model: Model, points: Floats, size: tuple[int, int]) -> NDArray[np.bool_]:
+def _in_image(model: BundleModel, points: Floats, size: tuple[int, int]) -> NDArray[np.bool_]:
     inside = (points - model.shift) @ model.turn
     ahead = inside[:, 2] > 0
     pixels, _, _ = project(model.projector, np.where(ahead[:, None], inside, [0.0, 0.0, 1.0]))
     return np.asarray(ahead & (pixels >= 0).all(axis=1) & (pixels <= np.array(size) - 1).all(axis=1))
 
 
-def uncertainties(model: Model, volume: Volume, covariance: Floats, axis: str) -> tuple[Floats, Floats]:
+def uncertainties(model: BundleModel, volume: Volume, covariance: Floats, axis: str) -> tuple[Floats, Floats]:
     """Standard uncertainties of the volume's points, (27, 3): in the scanner's frame, and of their shape alone.
 
     The scanner's frame is its camera's, and where exactly that looks is the least known of all; whatever places the
@@ -172,7 +172,7 @@ def best_pose(
             for around in AROUND_DEG if tilt else (0.0,):
                 lean = math.radians(around)
                 turn = rotation(math.radians(tilt) * np.array([-math.sin(lean), math.cos(lean), 0.0]))
-                trial = Model(
+                trial = BundleModel(
                     model.camera,
                     model.projector,
                     model.turn,

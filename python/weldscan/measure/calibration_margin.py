@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldscan._weldcore import Lens, Scanner
-from weldscan.calibration.bundle import K3, PARAMETERS, Features, Model, prior_sigmas, rotation, rows_of
+from weldscan.calibration.bundle import K3, PARAMETERS, BundleModel, Features, prior_sigmas, rotation, rows_of
 from weldscan.calibration.volume import point_jacobian
 from weldscan.measure.part_views import PartView
 from weldscan.records.scanner import ScannerSpec
@@ -166,7 +166,7 @@ def _propagated(gain: Floats, covariance: Floats) -> Floats:
     return np.asarray(np.sqrt(np.maximum(np.einsum("ai,ij,aj->a", gain, covariance, gain), 0.0)))
 
 
-def model_of(scanner: Scanner, turns: Floats, shifts: Floats) -> Model:
+def model_of(scanner: Scanner, turns: Floats, shifts: Floats) -> BundleModel:
     """A scanner's numbers as the bundle adjustment has them, with the poses of a board."""
 
     def numbers(lens: Lens) -> Floats:
@@ -175,7 +175,7 @@ def model_of(scanner: Scanner, turns: Floats, shifts: Floats) -> Model:
 
     relation = scanner.camera_from_projector
     shape = np.zeros((CORNERS[0] * CORNERS[1], 3))
-    return Model(
+    return BundleModel(
         numbers(scanner.camera), numbers(scanner.projector), relation[:3, :3], relation[:3, 3], turns, shifts, shape
     )
 

@@ -322,13 +322,13 @@ def _obey_lines(controller: Controller) -> None:
 
 
 def _inject(controller: Controller, request: str) -> None:
-    from weldscan.simulated.controllers import Fault
+    from weldscan.simulated.controllers import LinkFault
 
     words = request.split()
     try:
-        controller.inject(Fault(words[0]), int(words[1]) if len(words) > 1 else 1)
+        controller.inject(LinkFault(words[0]), int(words[1]) if len(words) > 1 else 1)
     except (IndexError, ValueError):
-        known = ", ".join(fault.value for fault in Fault)
+        known = ", ".join(fault.value for fault in LinkFault)
         raise InputError(f"fault: {request.strip()!r} is not FAULT [COUNT] with one of {known}") from None
 
 

@@ -35,7 +35,7 @@ LOOK_S = 0.05
 """How often a serving thread looks whether it shall stop."""
 
 
-class Fault(StrEnum):
+class LinkFault(StrEnum):
     """What a simulated controller does wrong with one reply. Not every link can commit every fault."""
 
     SILENCE = "silence"
@@ -137,12 +137,12 @@ class Arm:
         self._start = self._target = target
         self._seconds, self._aim = 0.0, None
 
-    def position(self, fault: Fault | None = None) -> KukaPose:
+    def position(self, fault: LinkFault | None = None) -> KukaPose:
         """Return $POS_ACT: the tool in base."""
         flange = self.flange()
-        self._frozen = (self._frozen or flange) if fault is Fault.STALE else None
+        self._frozen = (self._frozen or flange) if fault is LinkFault.STALE else None
         flange = self._frozen or flange
-        if fault is Fault.JUMP:
+        if fault is LinkFault.JUMP:
             flange = KukaPose(flange.x_mm + 400.0, *flange.values()[1:])
         return KukaPose.from_matrix(np.linalg.inv(self.base.matrix()) @ flange.matrix() @ self.tool.matrix())
 
@@ -152,14 +152,14 @@ class Controller:
 
     def __init__(self, arm: Arm | None = None) -> None:
         self.arm = arm or Arm()
-        self._faults: deque[Fault] = deque()
+        self._faults: deque[LinkFault] = deque()
         self._stop = threading.Event()
 
-    def inject(self, fault: Fault, replies: int = 1) -> None:
+    def inject(self, fault: LinkFault, replies: int = 1) -> None:
         """Let the next replies have a fault, after those that wait already."""
         self._faults.extend([fault] * replies)
 
-    def _next_fault(self) -> Fault | None:
+    def _next_fault(self) -> LinkFault | None:
         return self._faults.popleft() if self._faults else None
 
     def close(self) -> None:
@@ -188,7 +188,7 @@ class StreamController(Controller, ABC):
         """Cut one request off the front."""
 
     @abstractmethod
-    def answer(self, request: bytes, fault: Fault | None) -> bytes:
+    def answer(self, request: bytes, fault: LinkFault | None) -> bytes:
         """Give the reply, with the fault in its content where the fault is one of content."""
 
     def serve(self, transport: Transport) -> None:
@@ -206,30 +206,30 @@ class StreamController(Controller, ABC):
                 deadline_s = time.monotonic() + 2.0
                 for piece in self._spoilt(reply, fault):
                     transport.send(piece, deadline_s)
-                if fault is Fault.RESET or fault is Fault.RESTART:
+                if fault is LinkFault.RESET or fault is LinkFault.RESTART:
                     self._break(transport, fault)
                     break
 
-    def _spoilt(self, reply: bytes, fault: Fault | None) -> Iterator[bytes]:
+    def _spoilt(self, reply: bytes, fault: LinkFault | None) -> Iterator[bytes]:
         match fault:
-            case Fault.SILENCE | Fault.RESTART:
+            case LinkFault.SILENCE | LinkFault.RESTART:
                 return
-            case Fault.BYTES:
+            case LinkFault.BYTES:
                 for byte in reply:
                     yield bytes([byte])
                     time.sleep(0.0002)
-            case Fault.TWICE:
+            case LinkFault.TWICE:
                 yield reply + reply
-            case Fault.GARBAGE:
+            case LinkFault.GARBAGE:
                 yield os.urandom(64).replace(b"<", b"#").replace(b"\n", b"#") + b"\r\n"
-            case Fault.HUGE:
+            case LinkFault.HUGE:
                 yield reply[:7] + b"A" * HUGE_BYTES
-            case Fault.RESET:
+            case LinkFault.RESET:
                 yield reply[: len(reply) // 2]
             case _:
                 yield reply
 
-    def _break(self, transport: Transport, fault: Fault) -> None:
+    def _break(self, transport: Transport, fault: LinkFault) -> None:
         transport.close()
 
 
@@ -280,8 +280,8 @@ class TcpController(StreamController):
             self._open.discard(peer)
             peer.close()
 
-    def _break(self, transport: Transport, fault: Fault) -> None:
-        if fault is Fault.RESTART:
+    def _break(self, transport: Transport, fault: LinkFault) -> None:
+        if fault is LinkFault.RESTART:
             self._away.set()
             super()._break(transport, fault)
         elif isinstance(transport, TcpTransport):

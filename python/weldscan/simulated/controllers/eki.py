@@ -23,7 +23,7 @@ from weldscan.devices.robots.program import Status
 from weldscan.devices.robots.wire import LARGEST_MESSAGE, Transport, cut_xml
 from weldscan.errors import DeviceError
 from weldscan.pose import KukaPose
-from weldscan.simulated.controllers import LOOK_S, Arm, Controller, Fault, OutOfReach, TcpController
+from weldscan.simulated.controllers import LOOK_S, Arm, Controller, LinkFault, OutOfReach, TcpController
 from weldscan.simulated.controllers.program import carry_out, codes
 
 
@@ -48,7 +48,7 @@ class EkiController(TcpController):
             threading.Thread(target=self._stream, args=(transport,), daemon=True).start()
         super().serve(transport)
 
-    def answer(self, request: bytes, fault: Fault | None) -> bytes:
+    def answer(self, request: bytes, fault: LinkFault | None) -> bytes:
         """Do what the command says."""
         values = dissect(self.config.receive, request)
         if not self.config.asks:
@@ -58,18 +58,18 @@ class EkiController(TcpController):
         status = Status.DONE if command == POSE else Status.UNKNOWN_COMMAND
         if command == MOVE:
             status = carry_out(self.arm, KukaPose(*target), self._stop)
-        if fault is Fault.EMPTY:
+        if fault is LinkFault.EMPTY:
             return b"<Robot></Robot>"
-        shown = int(number) + (1 if fault is Fault.WRONG_ID else 0)
+        shown = int(number) + (1 if fault is LinkFault.WRONG_ID else 0)
         reply = compose(self.config.send, state(self.config.send, self.arm, fault, shown, status))
         match fault:
-            case Fault.DTD:
+            case LinkFault.DTD:
                 return b'<!DOCTYPE Robot SYSTEM "http://127.0.0.1/robot.dtd">' + reply
-            case Fault.ENTITY:
+            case LinkFault.ENTITY:
                 return b'<!DOCTYPE Robot [<!ENTITY x "' + b"9" * 1000 + b'">]>' + reply.replace(b'X="', b'X="&x;', 1)
-            case Fault.WRONG_LENGTH:
+            case LinkFault.WRONG_LENGTH:
                 return reply.replace(b"</Robot>", b"</Robat>")
-            case Fault.NAN:
+            case LinkFault.NAN:
                 return reply.replace(b'X="', b'X="NaN" Q="', 1)
             case _:
                 return reply
@@ -114,7 +114,7 @@ class EkiUdpController(Controller):
 
 
 def state(
-    elements: tuple[Element, ...], arm: Arm, fault: Fault | None = None, number: int = 0, status: int = 0
+    elements: tuple[Element, ...], arm: Arm, fault: LinkFault | None = None, number: int = 0, status: int = 0
 ) -> dict[Element, str]:
     """Return what an arm has to say to every element, found by the names that configurations use; 0 for the others."""
     frames = {"Tool": arm.tool, "Base": arm.base}

@@ -17,7 +17,7 @@ from weldscan.devices.robots.kvp import (
 )
 from weldscan.errors import InputError
 from weldscan.pose import format_e6axis, format_e6pos, format_frame, parse_frame
-from weldscan.simulated.controllers import Arm, Fault, OutOfReach, TcpController
+from weldscan.simulated.controllers import Arm, LinkFault, OutOfReach, TcpController
 
 
 class KvpController(TcpController):
@@ -37,10 +37,10 @@ class KvpController(TcpController):
         """Cut one request."""
         return cut_frame(buffer)
 
-    def answer(self, request: bytes, fault: Fault | None) -> bytes:
+    def answer(self, request: bytes, fault: LinkFault | None) -> bytes:
         """Read or write variables."""
         number, function, texts = decode_request(request)
-        if fault is Fault.WRONG_ID:
+        if fault is LinkFault.WRONG_ID:
             number ^= 0x00FF
         if function in (WRITE, WRITE_UNICODE, WRITE_MANY):
             for name, value in zip(texts[::2], texts[1::2], strict=True):
@@ -52,21 +52,21 @@ class KvpController(TcpController):
             return encode_reply(number, function, [None], ok=False)
         # An unknown variable: C3 Bridge says so, KUKAVARPROXY answers success with nothing in it.
         ok = not (self.c3 and None in values)
-        if fault is Fault.EMPTY:
+        if fault is LinkFault.EMPTY:
             values = [None for _ in values]
         reply = encode_reply(number, function, values, ok=ok)
-        if fault is Fault.WRONG_LENGTH:
+        if fault is LinkFault.WRONG_LENGTH:
             reply = framed(number, reply[4:] + bytes(7))
         return reply
 
-    def _get(self, name: str, fault: Fault | None) -> str | None:
+    def _get(self, name: str, fault: LinkFault | None) -> str | None:
         arm = self.arm
         if name == "COM_ACTION" and not arm.moving and self.variables["$PRO_STATE1"] == "#P_ACTIVE":
             return "0"
         match name:
             case "$POS_ACT":
                 text = format_e6pos(arm.position(fault))
-                return "{E6POS: X NaN, " + text.split(", ", 1)[1] if fault is Fault.NAN else text
+                return "{E6POS: X NaN, " + text.split(", ", 1)[1] if fault is LinkFault.NAN else text
             case "$AXIS_ACT":
                 return format_e6axis(arm.joints_deg)
             case "$TOOL":

@@ -6,7 +6,7 @@ import threading
 
 from weldscan.devices.robots.program import INTERPOLATIONS, MODES, POLL_S, Status
 from weldscan.pose import KukaPose
-from weldscan.simulated.controllers import Arm, Fault, OutOfReach
+from weldscan.simulated.controllers import Arm, LinkFault, OutOfReach
 
 
 def carry_out(arm: Arm, target: KukaPose, stop: threading.Event) -> Status:
@@ -28,7 +28,7 @@ def codes(arm: Arm) -> tuple[int, int]:
     return mode, next((code for code, name in INTERPOLATIONS.items() if name == arm.interpolation), 0)
 
 
-def numbers(arm: Arm, fault: Fault | None) -> list[float]:
+def numbers(arm: Arm, fault: LinkFault | None) -> list[float]:
     """Return $POS_ACT, $TOOL, $BASE and the joints."""
     position = arm.position(fault)
     return [*position.values(), *arm.tool.values(), *arm.base.values(), *arm.joints_deg]

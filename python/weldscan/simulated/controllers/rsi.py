@@ -9,7 +9,7 @@ import time
 
 from weldscan.devices.robots.rsi import CARTESIAN, JOINTS
 from weldscan.devices.robots.rsi_answer import IPOC, LARGEST_PACKET
-from weldscan.simulated.controllers import HUGE_BYTES, Arm, Controller, Fault
+from weldscan.simulated.controllers import HUGE_BYTES, Arm, Controller, LinkFault
 
 
 class RsiController(Controller):
@@ -40,7 +40,7 @@ class RsiController(Controller):
         self._thread.join(5.0)
         self._socket.close()
 
-    def packet(self, fault: Fault | None = None) -> bytes:
+    def packet(self, fault: LinkFault | None = None) -> bytes:
         """Return what one cycle sends."""
         pose = dict(zip(CARTESIAN, self.arm.position(fault).values(), strict=True))
         joints = dict(zip(JOINTS, self.arm.joints_deg, strict=True))
@@ -49,17 +49,17 @@ class RsiController(Controller):
             f'<Delay D="{self.late}"/><IPOC>{self.ipoc}</IPOC></Rob>'
         ).encode()
         match fault:
-            case Fault.GARBAGE:
+            case LinkFault.GARBAGE:
                 return b"\xff\x00 not XML at all"
-            case Fault.EMPTY:
+            case LinkFault.EMPTY:
                 return b'<Rob Type="KUKA"><IPOC>%d</IPOC></Rob>' % self.ipoc
-            case Fault.NAN:
+            case LinkFault.NAN:
                 return text.replace(b'X="', b'X="nan" Q="', 1)
-            case Fault.HUGE:
+            case LinkFault.HUGE:
                 return text.replace(b"<Delay", b"<EStr>" + b"A" * min(HUGE_BYTES, 60_000) + b"</EStr><Delay")
-            case Fault.DTD:
+            case LinkFault.DTD:
                 return b'<!DOCTYPE Rob SYSTEM "http://127.0.0.1/rob.dtd">' + text
-            case Fault.ENTITY:
+            case LinkFault.ENTITY:
                 return b'<!DOCTYPE Rob [<!ENTITY x "1">]>' + text.replace(b'X="', b'X="&x;', 1)
             case _:
                 return text
@@ -68,17 +68,17 @@ class RsiController(Controller):
         next_s = time.monotonic()
         while not self._stop.is_set():
             fault = self._next_fault()
-            if fault is Fault.RESTART:
+            if fault is LinkFault.RESTART:
                 self.ipoc = 1000
                 if self._stop.wait(1.0):
                     break
                 next_s = time.monotonic()
-            if fault is not Fault.SILENCE:
+            if fault is not LinkFault.SILENCE:
                 with contextlib.suppress(OSError):
                     self._socket.sendto(self.packet(fault), self._peer)
             self._judge(next_s + self.cycle_s)
             self.cycles += 1
-            if fault is not Fault.STALE:
+            if fault is not LinkFault.STALE:
                 self.ipoc += round(self.cycle_s * 1000)
             next_s += self.cycle_s
             if self._stop.wait(max(next_s - time.monotonic(), 0.0)):

@@ -9,7 +9,7 @@ from weldscan.devices.robots.program import Status
 from weldscan.devices.robots.serial import cut_line, decode_line, encode_line
 from weldscan.devices.robots.wire import FileTransport
 from weldscan.pose import KukaPose
-from weldscan.simulated.controllers import LOOK_S, Arm, Fault, StreamController
+from weldscan.simulated.controllers import LOOK_S, Arm, LinkFault, StreamController
 from weldscan.simulated.controllers.program import carry_out, codes, numbers
 
 
@@ -38,7 +38,7 @@ class SerialController(StreamController):
         """Cut one line."""
         return cut_line(buffer)
 
-    def answer(self, request: bytes, fault: Fault | None) -> bytes:
+    def answer(self, request: bytes, fault: LinkFault | None) -> bytes:
         """Do what the line says."""
         number, (command, *words) = decode_line(request)
         status = Status.DONE if command == "POSE" else Status.UNKNOWN_COMMAND
@@ -47,14 +47,14 @@ class SerialController(StreamController):
         words = [str(int(code)) for code in (status, *codes(self.arm))]
         words += [f"{value:.6f}" for value in numbers(self.arm, fault)]
         match fault:
-            case Fault.NAN:
+            case LinkFault.NAN:
                 words[3] = "NaN"
-            case Fault.EMPTY:
+            case LinkFault.EMPTY:
                 words = []
-            case Fault.WRONG_ID:
+            case LinkFault.WRONG_ID:
                 number += 1
         line = encode_line(number, " ".join(words))
-        return line.replace(b".", b"", 1) if fault is Fault.WRONG_LENGTH else line
+        return line.replace(b".", b"", 1) if fault is LinkFault.WRONG_LENGTH else line
 
     def _run(self) -> None:
         while not self._stop.is_set():  # a fault ends one round of serving, not the terminal

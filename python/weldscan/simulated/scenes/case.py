@@ -11,7 +11,7 @@ import numpy as np
 
 from weldscan.simulated.scenes.scene import FIELD_MM, View, limit_for
 from weldscan.simulated.scenes.seen_arc import BIN_DEG
-from weldscan.simulated.scenes.welds import Cap, Wall, Wander, Weld
+from weldscan.simulated.scenes.welds import Cap, SceneWall, SceneWeld, Wander
 
 
 @dataclass
@@ -35,8 +35,8 @@ class Case:
     views: tuple[View, ...] = ()
     base: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Of the walls' misfit: direction, share of it that is a difference of radius, sign of that."""
-    reference: Wall = field(default_factory=Wall)
-    other: Wall = field(default_factory=Wall)
+    reference: SceneWall = field(default_factory=SceneWall)
+    other: SceneWall = field(default_factory=SceneWall)
     cap: Cap = field(default_factory=Cap)
     seam_mm: float = 0.0
     seam_wander: Wander = field(default_factory=Wander)
@@ -90,7 +90,7 @@ class Case:
         """An angle's width, rad, not shorter than some mm of girth (what can be dented is not narrower)."""
         return max(math.radians(self.uniform(low, high)), least_mm / self.radius_mm)
 
-    def misfit(self, amplitude: float, wall: Wall | None = None) -> Wall:
+    def misfit(self, amplitude: float, wall: SceneWall | None = None) -> SceneWall:
         """The other wall moved and widened by an amplitude."""
         at, share, sign = self.base
         wall = self.other if wall is None else wall
@@ -101,8 +101,8 @@ class Case:
             offset_mm=(moved * math.cos(at), moved * math.sin(at)),
         )
 
-    def weld(self, **change: Any) -> Weld:
-        made = Weld(
+    def weld(self, **change: Any) -> SceneWeld:
+        made = SceneWeld(
             self.radius_mm,
             self.thickness_mm,
             half_length_mm=round(1.1 * self.field_mm, 1),

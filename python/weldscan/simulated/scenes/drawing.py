@@ -16,7 +16,7 @@ from weldscan.simulated.scenes.kinds import KINDS, Group
 from weldscan.simulated.scenes.scene import FIELD_MM, Scene, View, distance_for, scanner_for
 from weldscan.simulated.scenes.seen_arc import BIN_DEG, angles_of, bins_of
 from weldscan.simulated.scenes.truth import HONEST, OVER
-from weldscan.simulated.scenes.welds import Cap, Floats, Matrix, Unevenness, Wander, Weld, surface_of
+from weldscan.simulated.scenes.welds import Cap, Floats, Matrix, SceneWeld, Wander, Waviness, surface_of
 
 
 def draw(kind: str, seed: int) -> Scene:
@@ -87,12 +87,12 @@ def _cap_of(case: Case) -> None:
 def _waves_of(case: Case) -> None:
     """Each wall's own unevenness: 0.002 to 0.05 mm, of one scale or two."""
 
-    def waves() -> tuple[Unevenness, ...]:
+    def waves() -> tuple[Waviness, ...]:
         sd = min(case.log(0.002, 0.05), 0.05 * case.limit)
-        first = Unevenness(sd, case.log(8.0, 60.0), case.log(8.0, 150.0))
+        first = Waviness(sd, case.log(8.0, 60.0), case.log(8.0, 150.0))
         if case.random.random() < 0.6:
             return (first,)
-        return first, Unevenness(0.4 * sd, case.log(5.0, 12.0), case.log(5.0, 20.0))
+        return first, Waviness(0.4 * sd, case.log(5.0, 12.0), case.log(5.0, 20.0))
 
     case.reference = replace(case.reference, unevenness=waves())
     case.other = replace(case.other, unevenness=waves())
@@ -173,15 +173,15 @@ def _matrix(pose: Floats) -> Matrix:
     return tuple(tuple(float(v) for v in row) for row in pose)
 
 
-def _solved(case: Case, make: Callable[[float], Weld], target_mm: float, group: Group) -> Weld:
+def _solved(case: Case, make: Callable[[float], SceneWeld], target_mm: float, group: Group) -> SceneWeld:
     """Return the weld of the amplitude whose largest step in the arc seen is the target (honest: not above it)."""
     angles = angles_of(case.bins, case.radius_mm).ravel()
 
-    def both(weld: Weld) -> Floats:
+    def both(weld: SceneWeld) -> Floats:
         edges = surface_of(weld).edges(angles)
         return np.array([edges[:, 3] - edges[:, 2], edges[:, 5]])
 
-    def smooth(weld: Weld) -> Weld:
+    def smooth(weld: SceneWeld) -> SceneWeld:
         return replace(weld, reference=replace(weld.reference, unevenness=()), other=replace(weld.other, unevenness=()))
 
     # The waves do not depend on the amplitude: they are drawn once.

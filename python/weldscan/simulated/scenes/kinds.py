@@ -26,13 +26,13 @@ from weldscan.simulated.scenes.welds import (
     Dent,
     Flare,
     Harmonic,
+    SceneWall,
+    SceneWeld,
     SecondSeam,
     Spatter,
     Strip,
     Taper,
-    Wall,
     Wander,
-    Weld,
 )
 
 Group: TypeAlias = Literal["clean", "other-honest", "defective"]
@@ -45,7 +45,7 @@ class Kind:
     name: str
     what: str
     group: Group
-    weld: Callable[[Case], Callable[[float], Weld]]
+    weld: Callable[[Case], Callable[[float], SceneWeld]]
     """From a case to the weld of an amplitude, mm: the amplitude is sought that gives the step that was drawn."""
     case: Callable[[Case], None] = lambda case: None
     """Changes the case before its views are set up."""
@@ -53,16 +53,16 @@ class Kind:
     """Changes the scene at the end: darkness, saturation, another pipe."""
 
 
-def _aligned(case: Case) -> Wall:
+def _aligned(case: Case) -> SceneWall:
     """The other wall with a misfit of up to a third of the limit: what undisturbed walls show of a defective weld."""
     return case.misfit(case.uniform(0.0, 0.33) * case.limit)
 
 
-def _misfit(case: Case) -> Callable[[float], Weld]:
+def _misfit(case: Case) -> Callable[[float], SceneWeld]:
     return lambda a: case.weld(other=case.misfit(a))
 
 
-def _on_either(case: Case, change: Callable[[Wall, float], Wall]) -> Callable[[float], Weld]:
+def _on_either(case: Case, change: Callable[[SceneWall, float], SceneWall]) -> Callable[[float], SceneWeld]:
     """What is done to a wall is done to the one or the other."""
     other = _aligned(case)
     if case.random.random() < 0.5:
@@ -70,31 +70,31 @@ def _on_either(case: Case, change: Callable[[Wall, float], Wall]) -> Callable[[f
     return lambda a: case.weld(other=other, reference=change(case.reference, a))
 
 
-def _taper(slope: float | None) -> Callable[[Case], Callable[[float], Weld]]:
-    def weld(case: Case) -> Callable[[float], Weld]:
+def _taper(slope: float | None) -> Callable[[Case], Callable[[float], SceneWeld]]:
+    def weld(case: Case) -> Callable[[float], SceneWeld]:
         steep = case.log(0.05, 0.25) if slope is None else slope
         return _on_either(case, lambda wall, a: replace(wall, taper=Taper(a, steep)))
 
     return weld
 
 
-def _counterbore(low_mm: float, high_mm: float) -> Callable[[Case], Callable[[float], Weld]]:
-    def weld(case: Case) -> Callable[[float], Weld]:
+def _counterbore(low_mm: float, high_mm: float) -> Callable[[Case], Callable[[float], SceneWeld]]:
+    def weld(case: Case) -> Callable[[float], SceneWeld]:
         floor, slope = min(case.uniform(low_mm, high_mm), 0.25 * case.field_mm), case.log(0.25, 1.0)
         return _on_either(case, lambda wall, a: replace(wall, counterbore=Counterbore(a, floor, slope)))
 
     return weld
 
 
-def _flare(case: Case) -> Callable[[float], Weld]:
+def _flare(case: Case) -> Callable[[float], SceneWeld]:
     decay, sign = case.uniform(3.0, 6.0), case.sign()
     return _on_either(case, lambda wall, a: replace(wall, flare=Flare(sign * a, decay)))
 
 
 def _dent(
     low_deg: float, high_deg: float, decay: tuple[float, float], sign: float = 1.0
-) -> Callable[[Case], Callable[[float], Weld]]:
-    def weld(case: Case) -> Callable[[float], Weld]:
+) -> Callable[[Case], Callable[[float], SceneWeld]]:
+    def weld(case: Case) -> Callable[[float], SceneWeld]:
         at, width = case.inside(), case.degrees(low_deg, high_deg)
         length = math.inf if math.isinf(decay[1]) else case.uniform(*decay)
         cosine = bool(case.random.random() < 0.5)
@@ -104,7 +104,7 @@ def _dent(
     return weld
 
 
-def _ring(case: Case) -> Callable[[float], Weld]:
+def _ring(case: Case) -> Callable[[float], SceneWeld]:
     between = min(case.uniform(8.0, 30.0), 0.25 * case.field_mm)
     width = case.cap.width_mm * case.uniform(0.8, 1.1)
     distance = 0.5 * (width + case.cap.width_mm) + between
@@ -114,13 +114,13 @@ def _ring(case: Case) -> Callable[[float], Weld]:
     return lambda a: case.weld(other=other, second=replace(second, ring_mm=sign * a))
 
 
-def _coat(case: Case) -> Callable[[float], Weld]:
+def _coat(case: Case) -> Callable[[float], SceneWeld]:
     start = case.uniform(15.0, 30.0) - case.cap.width_mm / 2
     start = float(np.clip(start, 3.0, 0.2 * case.field_mm))
     # The coat hides the step: the other wall stands out by nearly as much.
     hidden, edge = case.uniform(0.8, 1.0), case.log(0.2, 2.0)
 
-    def weld(a: float) -> Weld:
+    def weld(a: float) -> SceneWeld:
         other = replace(case.other, radius_difference_mm=case.other.radius_difference_mm + a)
         coat = Strip(hidden * a, start, math.inf, edge)
         return case.weld(other=other, reference=replace(case.reference, strips=(coat,)))
@@ -128,12 +128,12 @@ def _coat(case: Case) -> Callable[[float], Weld]:
     return weld
 
 
-def _tape(case: Case) -> Callable[[float], Weld]:
+def _tape(case: Case) -> Callable[[float], SceneWeld]:
     thickness = min(case.uniform(0.2, 1.0), 0.8 * case.limit)
     start = case.uniform(1.0, 6.0)
     tape = Strip(thickness, start, start + case.uniform(20.0, 80.0), case.log(0.1, 0.5))
 
-    def weld(a: float) -> Weld:
+    def weld(a: float) -> SceneWeld:
         # The other wall lies deeper; the tape on it brings it up.
         other = replace(case.other, radius_difference_mm=case.other.radius_difference_mm - a, strips=(tape,))
         return case.weld(other=other)
@@ -141,20 +141,20 @@ def _tape(case: Case) -> Callable[[float], Weld]:
     return weld
 
 
-def _bump(case: Case, at_rad: float, width_rad: float) -> Callable[[float], Weld]:
+def _bump(case: Case, at_rad: float, width_rad: float) -> Callable[[float], SceneWeld]:
     """An arc of the whole wall that stands off."""
     other, sign = _aligned(case), case.sign()
     dent = Dent(0.0, at_rad, width_rad, math.inf)
     return lambda a: case.weld(other=replace(other, dents=(replace(dent, depth_mm=sign * a),)))
 
 
-def _in_the_dark(case: Case) -> Callable[[float], Weld]:
+def _in_the_dark(case: Case) -> Callable[[float], SceneWeld]:
     at, width = case.inside(0.2), case.degrees(4.0, 8.0, 6.0)
     case.dark_rad = (at - width / 2, at + width / 2)
     return _bump(case, at, width / 2)
 
 
-def _hardly_lit(case: Case) -> Callable[[float], Weld]:
+def _hardly_lit(case: Case) -> Callable[[float], SceneWeld]:
     arc = case.arc()
     lit = max(math.radians(float(case.random.choice([2.0, 4.0, 10.0]))), 4.0 / case.radius_mm)
     lit = min(lit, 0.4 * math.radians(BIN_DEG * len(arc)))
@@ -167,18 +167,18 @@ def _hardly_lit(case: Case) -> Callable[[float], Weld]:
     return _bump(case, middle, max(before, after) / 2)
 
 
-def _growing(case: Case) -> Callable[[float], Weld]:
+def _growing(case: Case) -> Callable[[float], SceneWeld]:
     arc = case.arc()
     end = math.radians(arc[-1] if case.random.random() < 0.5 else arc[0])
     return _bump(case, end, math.radians(BIN_DEG * len(arc)) * case.uniform(0.4, 1.0))
 
 
-def _oval(n: int, both: bool) -> Callable[[Case], Callable[[float], Weld]]:
-    def weld(case: Case) -> Callable[[float], Weld]:
+def _oval(n: int, both: bool) -> Callable[[Case], Callable[[float], SceneWeld]]:
+    def weld(case: Case) -> Callable[[float], SceneWeld]:
         at, turn = case.uniform(0.0, 2 * math.pi), case.uniform(0.6, 1.0) * math.pi / n
         other = _aligned(case)
 
-        def made(a: float) -> Weld:
+        def made(a: float) -> SceneWeld:
             reference = case.reference
             if both:
                 wave = (*reference.ovality, Harmonic(n, 0.6 * a, at + turn))
@@ -191,7 +191,7 @@ def _oval(n: int, both: bool) -> Callable[[Case], Callable[[float], Weld]]:
     return weld
 
 
-def _deep_dent(case: Case) -> Callable[[float], Weld]:
+def _deep_dent(case: Case) -> Callable[[float], SceneWeld]:
     # 8 mm over 3 degrees of a pipe of 630: no steeper than that elsewhere.
     width = max(math.radians(3.0), 16.0 / case.radius_mm)
     dent = Dent(0.0, case.inside(), width, math.inf, cosine=False)
@@ -199,15 +199,17 @@ def _deep_dent(case: Case) -> Callable[[float], Weld]:
     return lambda a: case.weld(other=replace(other, dents=(replace(dent, depth_mm=a),)))
 
 
-def _with_cap(make: Callable[[Case], Callable[[float], Weld]], **cap: Any) -> Callable[[Case], Callable[[float], Weld]]:
-    def weld(case: Case) -> Callable[[float], Weld]:
+def _with_cap(
+    make: Callable[[Case], Callable[[float], SceneWeld]], **cap: Any
+) -> Callable[[Case], Callable[[float], SceneWeld]]:
+    def weld(case: Case) -> Callable[[float], SceneWeld]:
         case.cap = replace(case.cap, **{k: v(case) if callable(v) else v for k, v in cap.items()})
         return make(case)
 
     return weld
 
 
-def _spatter(case: Case) -> Callable[[float], Weld]:
+def _spatter(case: Case) -> Callable[[float], SceneWeld]:
     arc, count = case.arc(), int(case.random.integers(5, 41))
     reach = 0.3 * case.field_mm
     drops = tuple(

@@ -11,7 +11,7 @@ import numpy as np
 from weldscan._weldcore import Lens, Scanner
 from weldscan.errors import InputError
 from weldscan.norms import limit_mm
-from weldscan.simulated.scenes.welds import Matrix, Weld
+from weldscan.simulated.scenes.welds import Matrix, SceneWeld
 
 NORM = ("pnae-g-7-010-89", "Table 1, column 2")
 """Whose limit a scene's step is drawn against."""
@@ -35,7 +35,7 @@ class Scene:
 
     kind: str
     seed: int
-    welds: tuple[Weld, ...]
+    welds: tuple[SceneWeld, ...]
     views: tuple[View, ...]
     field_mm: float
     """What the camera sees along the pipe: it sets the scanner."""

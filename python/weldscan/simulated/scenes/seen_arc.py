@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from weldscan._weldcore import Scanner
 from weldscan.simulated.scenes.scene import Scene, View
-from weldscan.simulated.scenes.welds import Floats, Weld
+from weldscan.simulated.scenes.welds import Floats, SceneWeld
 
 BIN_DEG = 2
 """Bins of the truth, centred on even degrees as those of a result's profile."""
@@ -29,7 +29,7 @@ def seen_arc(scene: Scene) -> list[int]:
     return bins_of(scene.views, scene.welds[0], scene.scanner)
 
 
-def bins_of(views: Sequence[View], weld: Weld, scanner: Scanner) -> list[int]:
+def bins_of(views: Sequence[View], weld: SceneWeld, scanner: Scanner) -> list[int]:
     quarter = np.radians(np.arange(0.0, 360.0, 0.25))
     inside = np.zeros(len(quarter), dtype=bool)
     for view in views:
@@ -44,7 +44,7 @@ def bins_of(views: Sequence[View], weld: Weld, scanner: Scanner) -> list[int]:
     ]
 
 
-def _in_field(pose: Floats, weld: Weld, scanner: Scanner, angle: Floats) -> NDArray[np.bool_]:
+def _in_field(pose: Floats, weld: SceneWeld, scanner: Scanner, angle: Floats) -> NDArray[np.bool_]:
     outward = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
     points = weld.radius_mm * outward + np.array([0.0, 0.0, weld.seam_mm])
     inverse = np.linalg.inv(pose)

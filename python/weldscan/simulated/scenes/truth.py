@@ -10,13 +10,13 @@ import numpy as np
 from weldscan.simulated.scenes.kinds import KINDS
 from weldscan.simulated.scenes.scene import Scene
 from weldscan.simulated.scenes.seen_arc import angles_of, seen_arc
-from weldscan.simulated.scenes.welds import Floats, Weld, surface_of
+from weldscan.simulated.scenes.welds import Floats, SceneWeld, surface_of
 
 HONEST, OVER = 0.8, (1.05, 3.0)
 """Largest true step in parts of the limit: of an honest scene at most, of a defective one from and to."""
 
 
-def _steps(weld: Weld, angles: Floats) -> Floats:
+def _steps(weld: SceneWeld, angles: Floats) -> Floats:
     """Return the step at the angles; with a second weld in view, the one of the two that is larger."""
     edges = surface_of(weld).edges(angles.ravel())
     first, second = edges[:, 3] - edges[:, 2], edges[:, 5]

@@ -28,7 +28,7 @@ class Harmonic:
 
 
 @dataclass(frozen=True)
-class Unevenness:
+class Waviness:
     """A Gaussian process over the wall, covariance `sd² exp(-½ (da/around)² - ½ (dz/along)²)`."""
 
     sd_mm: float
@@ -93,14 +93,14 @@ class Strip:
 
 
 @dataclass(frozen=True)
-class Wall:
+class SceneWall:
     """One pipe's outside: how it departs from the nominal cylinder."""
 
     radius_difference_mm: float = 0.0
     offset_mm: tuple[float, float] = (0.0, 0.0)
     tilt_rad: tuple[float, float] = (0.0, 0.0)
     ovality: tuple[Harmonic, ...] = ()
-    unevenness: tuple[Unevenness, ...] = ()
+    unevenness: tuple[Waviness, ...] = ()
     shrinkage_mm: float = 0.0
     """How far the weld drew it in at the seam."""
     taper: Taper | None = None
@@ -151,10 +151,10 @@ class Spatter:
 
 
 @dataclass(frozen=True)
-class Weld:
+class SceneWeld:
     """Two walls, a cap, and what is on them. z runs from the reference wall to the other one, the seam is near z = 0.
 
-    >>> weld = Weld(315.0, 6.0, other=Wall(taper=Taper(1.6, 0.1)))
+    >>> weld = SceneWeld(315.0, 6.0, other=SceneWall(taper=Taper(1.6, 0.1)))
     >>> edges = WeldSurface(weld).edges([0.0])[0]
     >>> float(round(edges[3] - edges[2], 6))
     -1.6
@@ -163,8 +163,8 @@ class Weld:
     radius_mm: float
     thickness_mm: float
     half_length_mm: float = 180.0
-    reference: Wall = Wall()
-    other: Wall = Wall()
+    reference: SceneWall = SceneWall()
+    other: SceneWall = SceneWall()
     cap: Cap = Cap()
     seam_mm: float = 0.0
     seam_wander: Wander = Wander()
@@ -174,6 +174,6 @@ class Weld:
 
 
 @lru_cache(maxsize=4)
-def surface_of(weld: Weld) -> WeldSurface:
+def surface_of(weld: SceneWeld) -> WeldSurface:
     """Return the weld's surface, its random parts drawn; the last few are kept."""
     return WeldSurface(weld)

@@ -6,9 +6,6 @@
 //! exposure, exposures fused, temporal unwrapping by [`Plan`], and a reason for every pixel without
 //! an answer.
 
-// Several tiles run in step through the kernels: there an index is plainer than a tower of zips.
-#![allow(clippy::needless_range_loop)]
-
 use multiversion::multiversion;
 use rayon::prelude::*;
 

@@ -24,7 +24,7 @@ use crate::error::{Error, Result, require_positive};
 use crate::ground::stop::polled;
 use crate::ground::threads;
 
-/// Coefficients in the true phase that are fitted: with three steps and a gamma of 2.2 the sixth is 0.1 mrad.
+/// Terms in the true phase that are fitted: with three steps and a gamma of 2.2 the sixth is 0.1 mrad.
 const FITTED: usize = 6;
 /// Rows that are looked at: 24 of a usual camera give the first term to 0.2 mrad.
 const ROWS: usize = 24;
@@ -228,7 +228,7 @@ struct Trial {
     measured: Vec<f32>,
 }
 
-/// RowEquations equations of a row, `matrix · step = right`.
+/// Normal equations of a row, `matrix · step = right`.
 struct RowEquations {
     matrix: Square,
     right: Coefficients,

@@ -5,7 +5,7 @@ use std::cell::Cell;
 use pyo3::exceptions::{PyKeyboardInterrupt, PyMemoryError};
 use pyo3::prelude::*;
 
-use crate::error::Error;
+use crate::error::{Error, Result};
 use crate::ground::stop::{Stopped, attended};
 
 /// Turns a core error into the exception of the same kind from `weldscan.errors`.
@@ -27,7 +27,7 @@ pub(crate) fn raise_as(py: Python<'_>, class: &str, message: String) -> PyErr {
 
 /// Detaches from the interpreter, computes, and maps the error. On the thread that hears signals a long computation ends
 /// where one is to end it (Ctrl-C).
-pub(crate) fn compute<T: Send>(py: Python<'_>, job: impl FnOnce() -> crate::Result<T> + Send) -> PyResult<T> {
+pub(crate) fn compute<T: Send>(py: Python<'_>, job: impl FnOnce() -> Result<T> + Send) -> PyResult<T> {
     crate::ground::threads::threads().map_err(|e| raise(py, &e))?;
     let main = is_main_thread(py)?;
     let (done, raised) = py.detach(|| {

@@ -21,7 +21,7 @@ const CHUNK: usize = 2048;
 pub(super) const FEWEST: usize = 3;
 /// The median absolute deviation of normal noise, times this, is its standard deviation.
 const MAD: f64 = 1.4826;
-/// RobustKernel widths in standard deviations at which robust estimates keep 95 % efficiency on normal noise.
+/// Kernel widths in standard deviations at which robust estimates keep 95 % efficiency on normal noise.
 const HUBER: f64 = 1.345;
 const TUKEY: f64 = 4.685;
 

@@ -146,7 +146,7 @@ impl<'a> Court<'a> {
                 let (sin, cos) = (TAU * misses[i]).sin_cos();
                 sum = [sum[0] + cos, sum[1] + sin];
                 random += usize::from(misses[i].abs() > RANDOM_MISS);
-                // CameraNoise alone makes the mean of the cosine smaller by this factor.
+                // Noise alone makes the mean of the cosine smaller by this factor.
                 out.cost[i] += ((-0.5 * TAU * TAU * variance).exp() - cos) as f32;
             }
             let mean = sum.map(|v| v / heard.len() as f64);

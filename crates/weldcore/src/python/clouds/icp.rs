@@ -136,7 +136,8 @@ impl PyRegistration {
 ///
 /// Args:
 ///     source: (n, 3), mm, n >= 3.
-///     target: (m, 3) points, mm, a `KdTree` of them (saves building it), a `Mesh`, a `Plane`, `Sphere` or `Cylinder`.
+///     target: (m, 3) points, mm, a `KdTree` of them (saves building it), a `Mesh`, a `Plane`, `Sphere` or
+///         `Cylinder`, or a fit of one of these.
 ///     metric: "point" or "plane". "plane" converges in a few rounds; "point" creeps along smooth surfaces.
 ///     normals: (m, 3) unit normals of the target's points, for a cloud with metric "plane"; points with NaN do not
 ///         count. None estimates them as `estimate_normals(target)` does.

@@ -58,7 +58,7 @@ pub struct Seen {
     pub row_px: f64,
     /// Angle about the pipe, rad.
     pub angle_rad: f64,
-    /// RayPlace along the pipe, mm.
+    /// Place along the pipe, mm.
     pub z_mm: f64,
     /// Cosine between the surface's normal and the light.
     pub light: f32,

@@ -161,7 +161,7 @@ pub struct Spatter {
 pub struct Scene {
     /// Nominal outside radius, mm.
     pub radius_mm: f64,
-    /// SceneWall thickness, mm: it sets how far shrinkage reaches.
+    /// Wall thickness, mm: it sets how far shrinkage reaches.
     pub thickness_mm: f64,
     /// The pipes end at this distance from z = 0, mm.
     pub half_length_mm: f64,

@@ -63,7 +63,7 @@ def test_a_fit_is_the_surface_that_it_fitted():
         # A surface makes its direction a unit vector anew.
         assert np.abs(distance(p, fit) - distance(p, surface)).max() < ROUNDING
         assert np.abs(distance(p, fit)).max() > 1
-    assert register_icp(ball + [0.1, 0, 0], sphere, metric="plane").rms_mm < 1e-6
+    assert register_icp(ball + np.array([0.1, 0, 0]), sphere, metric="plane").rms_mm < 1e-6
 
 
 def test_closed_mesh_has_an_inside():

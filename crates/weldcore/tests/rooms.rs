@@ -1,4 +1,5 @@
-//! Who uses whom in the core: no two files need each other, and no room one that stands above it.
+//! Who uses whom in the core: no two files need each other, and no room one that stands above it; and no two types have
+//! one name.
 //!
 //! Read from the paths in the source (`crate::…`, `super::…`, `mod …`), as far as they name files; tests may look anywhere.
 
@@ -175,6 +176,23 @@ fn no_room_uses_one_above_it_or_beside_it() {
     for (from, to) in [("fringes", "ground"), ("clouds", "surfaces"), ("weld", "surfaces"), ("python", "weld")] {
         assert!(arrows.contains(&(from.to_string(), to.to_string())), "{from} -> {to} is not seen");
     }
+}
+
+#[test]
+fn a_type_has_a_name_of_its_own() {
+    let mut homes = BTreeMap::<String, Vec<String>>::new();
+    for (module, path) in core() {
+        for line in code(&fs::read_to_string(path).unwrap()).lines().filter(|line| !line.starts_with(' ')) {
+            let words: Vec<&str> = line.split(|c: char| !(c.is_alphanumeric() || c == '_')).collect();
+            let at = words.iter().position(|w| ["struct", "enum", "trait", "type"].contains(w));
+            if let Some(name) = at.and_then(|at| words.get(at + 1)).filter(|n| n.starts_with(char::is_uppercase)) {
+                homes.entry((*name).to_string()).or_default().push(module.clone());
+            }
+        }
+    }
+    assert!(homes.len() > 150 && homes["Plane"] == ["surfaces::plane"], "{homes:?}");
+    homes.retain(|_, modules| modules.len() > 1);
+    assert_eq!(homes, BTreeMap::new());
 }
 
 #[test]

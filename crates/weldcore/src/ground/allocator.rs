@@ -4,7 +4,7 @@
 //! shot returns, that takes longer than computing what goes into them. [`Recycler`] keeps large blocks that were given
 //! back for the next large result, and asks for huge pages where the system offers them on request.
 //!
-//! There is a cushion, too, which is given up when the system refuses: then [`is_short`] is true, and the call in hand ends
+//! There is a cushion, too, which is given up when the system refuses: then `is_short` is true, and the call in hand ends
 //! at its next [`poll`](crate::ground::stop::poll).
 
 use std::alloc::{GlobalAlloc, Layout, System};

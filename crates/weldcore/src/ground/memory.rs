@@ -1,8 +1,8 @@
 //! Memory for large results, asked for before a call begins to fill it.
 //!
 //! Where the system has no memory left, a call ends (see [`stop`](crate::ground::stop)), not the process: what needs much
-//! of it asks by [`require`] whether it is to be had before it begins; for the rest there is a cushion (see
-//! [`allocator`](crate::ground::allocator)), so that a call gets to its next [`poll`](crate::ground::stop::poll) and ends
+//! of it asks by `require` whether it is to be had before it begins; for the rest there is a cushion (see
+//! [`allocator`](crate::ground::allocator)), so that a call gets to its next [`poll`] and ends
 //! there.
 
 use std::mem::MaybeUninit;

@@ -4,7 +4,7 @@
 //! does not return: it unwinds to [`attended`], which reports why. That leaves every algorithm as it is; what it had
 //! allocated is dropped on the way. Of all calls of a process one can be attended at a time, that of the thread which
 //! hears signals. Its parallel loops run in a pool of their own (see [`threads`](crate::ground::threads)), so that ending it ends
-//! no other thread's call; meanwhile its thread waits, and listens every [`PATIENCE`].
+//! no other thread's call; meanwhile its thread waits, and listens every `PATIENCE`.
 
 use std::any::Any;
 use std::cell::Cell;

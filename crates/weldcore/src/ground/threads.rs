@@ -2,7 +2,7 @@
 //!
 //! A pool's threads do not live on in a forked process, and a lock that one of them held stays locked there. So each
 //! process has its own pools and its own lock on them, reached without one. Of the two pools one is for the call that can
-//! be ended (see [`stop`](crate::ground::stop)), the other for all other threads' calls.
+//! be ended (see [`stop`]), the other for all other threads' calls.
 //! Their size is `WELDSCAN_THREADS`, else `RAYON_NUM_THREADS`, else the number of cores this process may use;
 //! [`set_threads`] changes it at run time. Loops run over chunks of a fixed size, and partial results are combined in the
 //! order of the chunks: the bits of a result do not depend on the number of threads.

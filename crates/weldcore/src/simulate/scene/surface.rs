@@ -77,7 +77,7 @@ impl WeldSurface {
     /// Draws the random parts.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] or [`Error::NonFinite`] naming the parameter.
+    /// [`Error::OutOfRange`](crate::Error::OutOfRange) or [`Error::NonFinite`](crate::Error::NonFinite) naming the parameter.
     pub fn new(scene: Scene) -> Result<Self> {
         scene.check()?;
         let stream = |number: u64| mix(scene.seed ^ mix(number));

@@ -4,12 +4,11 @@ use std::f64::consts::TAU;
 use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use weldcore::phase::{DecodeOptions, FringeSet, Shot, decode_phase, decode_shot};
-use weldcore::unwrap::unwrap_spatial;
+use weldcore::fringes::{DecodeOptions, FringeSet, Shot, decode_phase, decode_shot, unwrap_spatial};
 
 #[cfg(not(feature = "python"))] // which brings it along
 #[global_allocator]
-static ALLOCATOR: weldcore::memory::Recycler = weldcore::memory::Recycler;
+static ALLOCATOR: weldcore::ground::allocator::Recycler = weldcore::ground::allocator::Recycler;
 
 const WIDTH: usize = 1280;
 const HEIGHT: usize = 960;

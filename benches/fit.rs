@@ -3,7 +3,7 @@
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use weldcore::Vec3;
-use weldcore::fit::{Noise, cylinder, plane, robust, sphere, spheres};
+use weldcore::surfaces::{PointNoise, cylinder, find_spheres, plane, robust, sphere};
 
 /// Uniform in (-1, 1) from a counter.
 fn uniform(i: usize) -> f64 {
@@ -60,22 +60,22 @@ fn sizes(c: &mut Criterion) {
     for n in [10_000, 100_000, 1_000_000] {
         group.throughput(Throughput::Elements(n as u64));
         let (ball, pipe) = (ball(n, 0), pipe(n));
-        let found = sphere::fit(&ball, None, Noise::default()).expect("a ball");
+        let found = sphere::fit(&ball, None, PointNoise::default()).expect("a ball");
         assert!((found.surface.center_mm - CENTER).norm() < 0.01);
         group.bench_function(BenchmarkId::new("sphere", n), |b| {
-            b.iter(|| sphere::fit(&ball, None, Noise::default()));
+            b.iter(|| sphere::fit(&ball, None, PointNoise::default()));
         });
         group.bench_function(BenchmarkId::new("sphere, radius known", n), |b| {
-            b.iter(|| sphere::fit(&ball, Some(25.0), Noise::default()));
+            b.iter(|| sphere::fit(&ball, Some(25.0), PointNoise::default()));
         });
-        group.bench_function(BenchmarkId::new("plane", n), |b| b.iter(|| plane::fit(&pipe, Noise::default())));
-        let found = cylinder::fit(&pipe, None, Noise::default()).expect("a pipe");
+        group.bench_function(BenchmarkId::new("plane", n), |b| b.iter(|| plane::fit(&pipe, PointNoise::default())));
+        let found = cylinder::fit(&pipe, None, PointNoise::default()).expect("a pipe");
         assert!((found.surface.radius_mm - 315.0).abs() < 0.05);
         group.bench_function(BenchmarkId::new("cylinder", n), |b| {
-            b.iter(|| cylinder::fit(&pipe, None, Noise::default()));
+            b.iter(|| cylinder::fit(&pipe, None, PointNoise::default()));
         });
         group.bench_function(BenchmarkId::new("cylinder, from a start", n), |b| {
-            b.iter(|| cylinder::refine(&pipe, found.surface, true, Noise::default()));
+            b.iter(|| cylinder::refine(&pipe, found.surface, true, PointNoise::default()));
         });
     }
     group.finish();
@@ -96,10 +96,10 @@ fn among_outliers(c: &mut Criterion) {
 
 fn three_spheres(c: &mut Criterion) {
     let points = view();
-    assert_eq!(spheres::find(&points, Some(1280), 10.0, None).expect("three balls").len(), 3);
+    assert_eq!(find_spheres::find(&points, Some(1280), 10.0, None).expect("three balls").len(), 3);
     let mut group = c.benchmark_group("find spheres");
     group.sample_size(20);
-    group.bench_function("grid of 1280x960", |b| b.iter(|| spheres::find(&points, Some(1280), 10.0, Some(3))));
+    group.bench_function("grid of 1280x960", |b| b.iter(|| find_spheres::find(&points, Some(1280), 10.0, Some(3))));
     group.finish();
 }
 

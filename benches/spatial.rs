@@ -4,12 +4,13 @@
 use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use weldcore::distance::{Cylinder, Surface, Target, distance};
-use weldcore::icp::{Metric, Options, register};
-use weldcore::kdtree::{Follower, KdTree};
-use weldcore::mesh::Mesh;
-use weldcore::normals;
-use weldcore::transform::Transform;
+use weldcore::clouds::distance::{Target, distance};
+use weldcore::clouds::icp::{Metric, Options, register};
+use weldcore::clouds::kdtree::{Follower, KdTree};
+use weldcore::clouds::mesh::Mesh;
+use weldcore::clouds::normals;
+use weldcore::ground::transform::Transform;
+use weldcore::surfaces::{Cylinder, Surface};
 
 const RADIUS: f64 = 315.0;
 

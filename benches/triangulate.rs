@@ -4,13 +4,13 @@ use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use weldcore::Vec3;
-use weldcore::scanner::{Lens, Scanner};
-use weldcore::transform::Transform;
-use weldcore::triangulate::{Axis, triangulate};
+use weldcore::ground::transform::Transform;
+use weldcore::scanner::triangulate::triangulate;
+use weldcore::scanner::{Axis, Lens, Scanner};
 
 #[cfg(not(feature = "python"))] // which brings it along
 #[global_allocator]
-static ALLOCATOR: weldcore::memory::Recycler = weldcore::memory::Recycler;
+static ALLOCATOR: weldcore::ground::allocator::Recycler = weldcore::ground::allocator::Recycler;
 
 fn scanner() -> weldcore::Result<Scanner> {
     let camera = Lens::new(1280, 960, [2650.0, 2648.0], [647.5, 474.5], [-0.09, 0.12, 4e-4, -3e-4, 0.0])?;

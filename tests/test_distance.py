@@ -44,6 +44,28 @@ def test_analytic_targets_are_exact():
     assert sphere.radius_mm == cylinder.radius_mm == 7
 
 
+def test_a_fit_is_the_surface_that_it_fitted():
+    rng = np.random.default_rng(2)
+    flat = rng.uniform(-9, 9, (200, 3)) * [1, 1, 0]
+    unit = rng.normal(size=(200, 3))
+    ball = 5 * unit / np.linalg.norm(unit, axis=1, keepdims=True) + [1, 2, 3]
+    pipe = 4 * unit[:, :2] / np.linalg.norm(unit[:, :2], axis=1, keepdims=True)
+    pipe = np.c_[pipe, rng.uniform(-9, 9, 200)]
+    plane, sphere, cylinder = weldscan.fit_plane(flat), weldscan.fit_sphere(ball), weldscan.fit_cylinder(pipe)
+    [found] = weldscan.find_spheres(np.repeat(ball, 20, 0) + rng.normal(0, 0.01, (4000, 3)), 5, 1)
+    p = queries(500)
+    for fit, surface in (
+        (plane, Plane(plane.point_mm, plane.normal)),
+        (sphere, Sphere(sphere.center_mm, sphere.radius_mm)),
+        (cylinder, Cylinder(cylinder.point_mm, cylinder.axis, cylinder.radius_mm)),
+        (found, Sphere(found.center_mm, found.radius_mm)),
+    ):
+        # A surface makes its direction a unit vector anew.
+        assert np.abs(distance(p, fit) - distance(p, surface)).max() < ROUNDING
+        assert np.abs(distance(p, fit)).max() > 1
+    assert register_icp(ball + np.array([0.1, 0, 0]), sphere, metric="plane").rms_mm < 1e-6
+
+
 def test_closed_mesh_has_an_inside():
     mesh = Mesh(*tube())
     assert mesh.closed

@@ -434,7 +434,7 @@ class Mesh:
 
 def distance(
     points: ArrayLike,
-    target: ArrayLike | KdTree | Mesh | Plane | Sphere | Cylinder,
+    target: ArrayLike | KdTree | Mesh | Plane | Sphere | Cylinder | PlaneFit | SphereFit | CylinderFit | FoundSphere,
     signed: bool = True,
     *,
     normals: ArrayLike | None = None,
@@ -478,7 +478,7 @@ class Registration:
 
 def register_icp(
     source: ArrayLike,
-    target: ArrayLike | KdTree | Mesh | Plane | Sphere | Cylinder,
+    target: ArrayLike | KdTree | Mesh | Plane | Sphere | Cylinder | PlaneFit | SphereFit | CylinderFit | FoundSphere,
     metric: Literal["point", "plane"] = "point",
     *,
     normals: ArrayLike | None = None,

@@ -8,62 +8,33 @@
 //! - **Clouds** are `&[[f64; 3]]`; a pixel without a point holds NaN. Images are row-major.
 //! - **Precision**: geometry is `f64` and is centred before any solve; modulation, background and sigma are `f32`.
 //! - **Determinism**: the same input gives the same bits on any number of threads. Work is cut into chunks of fixed
-//!   size, partial sums are added in chunk order, ties go to the lowest index (see [`threads`]).
-//! - **Errors**: one enum, [`Error`]. Nothing here panics on any input; a call may be ended by unwinding (see [`stop`]).
+//!   size, partial sums are added in chunk order, ties go to the lowest index (see [`threads`](ground::threads)).
+//! - **Errors**: one enum, [`Error`]. Nothing here panics on any input; a call may be ended by unwinding (see [`stop`](ground::stop)).
 //!
 //! # Rooms
+//! Each may use those above it; `tests/rooms.rs` sees to that, and that no two files need each other.
+//!
 //! | module | what is in it |
 //! |---|---|
-//! | [`phase`] | fringe images to wrapped phase, modulation, background, noise |
-//! | [`unwrap`] | wrapped phase to absolute phase: temporal, Gray, spatial |
-//! | [`scanner`] | camera and projector with their lenses |
-//! | [`triangulate`] | phase to points; the reference-plane model of the paper |
-//! | [`transform`] | rigid transforms and their closed-form fit |
-//! | [`fit`] | plane, sphere, cylinder by orthogonal distance, with covariance; finding spheres in a cloud |
-//! | [`kdtree`] | exact nearest neighbours |
-//! | [`normals`] | surface normals from the pixel grid and from a bare cloud |
-//! | [`icp`] | iterative closest point |
-//! | [`distance`] | signed distance to clouds, meshes and analytic surfaces |
-//! | [`mesh`] | triangle meshes |
-//! | [`segment`] | reference wall, other wall and bead |
-//! | [`seam_fates`] | what became of every pixel, bin by bin along the seam |
-//! | [`sections`] | cap, toes, the surfaces beside them and the undisturbed walls, station by station |
-//! | [`place`] | the shots of a part joined into one cloud in base |
-//! | [`step`] | the step around the seam and its uncertainty |
-//! | [`threads`] | the pools of threads, and loops whose bits do not depend on them |
-//! | [`stop`] | ending a long call on request, or for want of memory |
-//! | [`memory`] | large results without the cost of fresh memory |
-//! | [`image`] | grey PNG files, read strictly |
-//! | [`simulate`] | ray-cast fringe images of analytic scenes |
+//! | [`ground`] | [`threads`](ground::threads) whose number changes no bit, [`stop`](ground::stop)ping a long call, [`memory`](ground::memory), [`image`](ground::image)s, [`transform`](ground::transform)s, [`robust`](ground::robust) statistics |
+//! | [`fringes`] | fringe images to wrapped and absolute phase: [`decode_shot`](fringes::decode_shot), [`decode_phase`](fringes::decode_phase), [`unwrap_temporal`](fringes::unwrap_temporal), [`unwrap_spatial`](fringes::unwrap_spatial), [`decode_gray`](fringes::decode_gray) |
+//! | [`surfaces`] | [`plane`](surfaces::plane), [`sphere`](surfaces::sphere), [`cylinder`](surfaces::cylinder): distance, foot, fit by orthogonal distance with covariance, [`robust`](surfaces::robust) fits; [`find_spheres`](surfaces::find_spheres) in a cloud |
+//! | [`scanner`] | camera and projector with their [`lens`](scanner::lens)es; phase to points ([`triangulate`](scanner::triangulate)); the [`reference_plane`](scanner::reference_plane) model of the paper |
+//! | [`clouds`] | exact nearest neighbours ([`kdtree`](clouds::kdtree)), [`normals`](clouds::normals), triangle [`mesh`](clouds::mesh)es, signed [`distance`](clouds::distance), iterative closest point ([`icp`](clouds::icp)) |
+//! | [`weld`] | [`segment`](weld::segment): walls and cap of a shot; [`sections`](weld::sections): toes and doubts, station by station; [`step`](weld::step) around the seam and its uncertainty; [`place`](weld::place): the shots of a part in base; [`seam_fates`](weld::seam_fates): what became of every pixel |
+//! | [`simulate`] | ray-cast fringe images of analytic scenes and welds, with the truth |
 
-pub mod distance;
+pub mod clouds;
 pub mod error;
-pub mod fit;
-pub mod icp;
-pub mod image;
-pub mod kdtree;
-pub mod memory;
-pub mod mesh;
-pub mod normals;
-pub mod phase;
-pub mod place;
+pub mod fringes;
+pub mod ground;
 pub mod scanner;
-pub mod seam_fates;
-pub mod sections;
-pub mod segment;
 pub mod simulate;
-mod statistics;
-pub mod step;
-pub mod stop;
-pub mod threads;
-pub mod transform;
-pub mod triangulate;
-pub mod unwrap;
+pub mod surfaces;
+pub mod weld;
 
 #[cfg(feature = "python")]
 mod python;
 
 pub use error::{Error, Result};
-
-/// A point or a direction, in the frame that the context names.
-pub type Vec3 = nalgebra::Vector3<f64>;
+pub use ground::transform::Vec3;

@@ -2,7 +2,7 @@
 
 A small error of the scanner's parameters c bends the space that it measures: a point p moves by dp/dc, the radial
 deviation of a wall's point by D = n . dp/dc. What both walls share cancels in the step; what bends them apart does not.
-With X the walls' model of `step.rs` (a correction of each shot's reference cylinder, h, the walls' shrinkage), V the
+With X the walls' model of `weld/step/` (a correction of each shot's reference cylinder, h, the walls' shrinkage), V the
 covariance of their unevenness, and x the row of h at the seam, the step's error is to first order
 
     g dc,    g = x (X^T V^-1 X)^-1 X^T V^-1 D,    u^2 = g C g^T.
@@ -372,7 +372,10 @@ def _shell(along_mm: Floats, radius_mm: float, wall_mm: float) -> Floats:
 
 
 def _root(around_mm: Floats, along_mm: Floats, unevenness: Unevenness, noise_mm2: float) -> Floats:
-    """Cholesky factor of the covariance of a wall's points: `Covariance` of `step.rs`, in units of the unevenness."""
+    """Cholesky factor of the covariance of a wall's points, in units of the unevenness.
+
+    It is the `Covariance` of `weld/step/unevenness.rs`.
+    """
     r = np.hypot(
         (around_mm[:, None] - around_mm) / max(unevenness.around_mm, 1e-9),
         (along_mm[:, None] - along_mm) / max(unevenness.along_mm, 1e-9),

@@ -10,26 +10,33 @@ use pyo3::PyClass;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyTuple};
 
-use super::distance::{PyCylinder, PyMesh, PyPlane, PySphere};
-use super::fit::{Common, CylinderFit, FoundSphere, PlaneFit, SphereFit};
-use super::icp::{PyRegistration, PyWeak};
-use super::kdtree::{PyFollower, PyKdTree};
-use super::phase::{PyDisagreement, PyPhaseMap, PyWrappedPhase};
-use super::response::PyPhaseError;
-use super::scanner::{PyLens, PyScanner};
-use super::segment::WeldShot;
-use super::simulate::{PyShot, PyWeldSurface};
-use super::transform::PyRigidFit;
-use super::triangulate::{PyCloud, PyReferencePlane};
-use super::{compute, raise, raise_as};
-use crate::kdtree::KdTree;
-use crate::mesh::Mesh;
+use crate::clouds::icp;
+use crate::clouds::kdtree::KdTree;
+use crate::clouds::mesh::Mesh;
+use crate::ground::transform::Transform;
+use crate::python::call::{compute, raise, raise_as};
+use crate::python::clouds::distance::PyMesh;
+use crate::python::clouds::icp::{PyRegistration, PyWeak};
+use crate::python::clouds::kdtree::{PyFollower, PyKdTree};
+use crate::python::fringes::decode::{PyDisagreement, PyPhaseMap};
+use crate::python::fringes::response::PyPhaseError;
+use crate::python::fringes::wrapped::PyWrappedPhase;
+use crate::python::ground::transform::PyRigidFit;
+use crate::python::scanner::lens::{PyLens, PyScanner};
+use crate::python::scanner::triangulate::{PyCloud, PyReferencePlane};
+use crate::python::simulate::scene::PyWeldSurface;
+use crate::python::simulate::shot::PyShot;
+use crate::python::surfaces::find_spheres::PyFoundSphere;
+use crate::python::surfaces::fit::{Common, CylinderFit, PlaneFit, SphereFit};
+use crate::python::surfaces::shapes::{PyCylinder, PyPlane, PySphere};
+use crate::python::weld::WeldShot;
 use crate::scanner::{Lens, Rays, Scanner};
-use crate::sections::{Doubt, Edge, Grid, Kind, Sections, Station, WallRun};
-use crate::segment::{PipeFrame, Segmentation, Unrolled};
-use crate::simulate::{Frames, Photometry, Sample, Shot};
-use crate::transform::Transform;
-use crate::{distance, fit, icp};
+use crate::simulate::{Frames, Photometry, Sample, SimulatedShot};
+use crate::surfaces::find_spheres::FoundSphere;
+use crate::surfaces::{Cylinder, Plane, Sphere};
+use crate::weld::sections::{Doubt, Edge, Grid, Kind, Sections, Station, WallRun};
+use crate::weld::segment::Segmentation;
+use crate::weld::{PipeFrame, Unrolled};
 
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
@@ -76,8 +83,8 @@ by_way_of! {
     bool: u8, |b: &bool| u8::from(*b), |n| (n < 2).then_some(n == 1);
     String: Vec<u8>, |text: &String| text.clone().into_bytes(), |bytes| String::from_utf8(bytes).ok();
     Kind: u8, |k: &Kind| *k as u8, |n| [Kind::Unknown, Kind::Raised, Kind::Hollow, Kind::Flush].get(usize::from(n)).copied();
-    icp::Kind: u8, |k: &icp::Kind| *k as u8,
-        |n| [icp::Kind::Translation, icp::Kind::Rotation, icp::Kind::Screw].get(usize::from(n)).copied();
+    icp::WeakKind: u8, |k: &icp::WeakKind| *k as u8,
+        |n| [icp::WeakKind::Translation, icp::WeakKind::Rotation, icp::WeakKind::Screw].get(usize::from(n)).copied();
     &'static str: String, |text: &&str| (*text).to_string(), |text| Some(lasting(text));
 }
 
@@ -166,13 +173,10 @@ structs! {
     Lens { width, height, fx, fy, cx, cy, dist }
     Transform { rotation, translation }
     Rays { x, y }
-    distance::Plane { point, normal }
-    distance::Sphere { center, radius }
-    distance::Cylinder { point, axis, radius }
-    fit::plane::Plane { point_mm, normal }
-    fit::sphere::Sphere { center_mm, radius_mm }
-    fit::cylinder::Cylinder { point_mm, axis, radius_mm }
-    fit::spheres::Found {
+    Plane { point_mm, normal }
+    Sphere { center_mm, radius_mm }
+    Cylinder { point_mm, axis, radius_mm }
+    FoundSphere {
         sphere, covariance, rms_mm, inliers, coverage, free_radius_mm, free_radius_sigma_mm,
     }
     Common { rms_mm, covariance, iterations, inliers }
@@ -243,7 +247,7 @@ by_bytes! {
     PyCylinder: o => o.0, it => Self(it);
     PyWeak: o => o.0, it => Self(it);
     PyRegistration: o => o.0, it => Self(it);
-    FoundSphere: o => o.0, it => Self(it);
+    PyFoundSphere: o => o.0, it => Self(it);
     WeldShot: o => o.0, it => Self(it);
     PlaneFit: o => *o, it => it;
     SphereFit: o => *o, it => it;
@@ -324,7 +328,7 @@ impl Pickled for PyMesh {
 impl Pickled for PyShot {
     fn apart<'py>(object: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
         let (py, o) = (object.py(), object.get());
-        let Shot { samples, edges, photometry, projector, .. } = &o.shot;
+        let SimulatedShot { samples, edges, photometry, projector, .. } = &o.shot;
         let seen = [packed(py, samples), packed(py, edges), packed(py, photometry), packed(py, projector)];
         let grid = [packed(py, &o.height), packed(py, &o.width), packed(py, &*o.rays)];
         let images = [object.getattr("white")?, object.getattr("frames")?];
@@ -332,7 +336,7 @@ impl Pickled for PyShot {
     }
     fn together(state: &Bound<'_, PyAny>) -> PyResult<Self> {
         let part = |i: usize| state.get_item(i);
-        let shot = Shot {
+        let shot = SimulatedShot {
             frames: Frames::Eight(Vec::new()),
             samples: unpacked(&part(0)?)?,
             edges: unpacked(&part(1)?)?,
@@ -386,7 +390,7 @@ macro_rules! classes {
 
 classes! {
     PyLens, PyScanner, PyPhaseMap, PyDisagreement, PyWrappedPhase, PyPhaseError, PyCloud, PyReferencePlane, PyKdTree,
-    PyFollower, PyPlane, PySphere, PyCylinder, PyMesh, PlaneFit, SphereFit, CylinderFit, FoundSphere, PyWeak,
+    PyFollower, PyPlane, PySphere, PyCylinder, PyMesh, PlaneFit, SphereFit, CylinderFit, PyFoundSphere, PyWeak,
     PyRegistration, PyRigidFit, WeldShot, PyShot, PyWeldSurface,
 }
 
@@ -410,7 +414,7 @@ fn _put_together(name: &str, version: &str, state: &Bound<'_, PyAny>) -> PyResul
     together(name, state)
 }
 
-pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(_take_apart, m)?)?;
     m.add_function(wrap_pyfunction!(_put_together, m)?)?;
     announce(m)

@@ -1,44 +1,10 @@
 //! What stands in a simulated scene: analytic shapes, each in its own frame, and their first intersection with a ray.
 
-use crate::Vec3;
 use crate::error::{Error, Result, require_positive};
-use crate::transform::Transform;
+use crate::ground::transform::{Transform, Vec3};
 
+use super::ray::{Hit, Ray, entry};
 use super::weld::Weld;
-
-/// A half line `origin + t * direction`, t > 0. The direction need not be a unit vector.
-#[derive(Debug, Clone, Copy)]
-pub struct Ray {
-    /// Where it starts.
-    pub origin: Vec3,
-    /// Where it goes.
-    pub direction: Vec3,
-}
-
-impl Ray {
-    /// The point at `t`.
-    #[inline]
-    pub fn at(&self, t: f64) -> Vec3 {
-        self.origin + self.direction * t
-    }
-
-    /// The same ray seen from another frame.
-    #[inline]
-    pub fn seen_from(&self, other_from_this: &Transform) -> Self {
-        Self { origin: other_from_this.apply(&self.origin), direction: other_from_this.rotation * self.direction }
-    }
-}
-
-/// The first point of a shape on a ray.
-#[derive(Debug, Clone, Copy)]
-pub struct Hit {
-    /// Ray parameter.
-    pub t: f64,
-    /// Outward unit normal, in the shape's frame.
-    pub normal: Vec3,
-    /// Added to the body's label: which part of the shape.
-    pub part: u8,
-}
 
 /// A shape in its own frame, mm.
 #[derive(Debug, Clone, PartialEq)]
@@ -70,7 +36,7 @@ pub enum Shape {
 
 /// How a surface answers to light.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Surface {
+pub struct Finish {
     /// Lambert reflectance, 0 to 1.
     pub albedo: f64,
     /// Height of the specular lobe, relative to a white Lambert surface lit squarely.
@@ -89,7 +55,7 @@ pub struct Body {
     /// Its place.
     pub scene_from_body: Transform,
     /// Its surface.
-    pub surface: Surface,
+    pub surface: Finish,
     /// Its label in the truth; a weld's parts are label (reference wall), label + 1 (other wall), label + 2 (bead).
     pub label: u8,
 }
@@ -152,7 +118,7 @@ impl Body {
 
     /// Albedo at a point of the surface, in the body's frame.
     pub(super) fn albedo(&self, p: &Vec3) -> f64 {
-        let Surface { albedo, brushed, .. } = self.surface;
+        let Finish { albedo, brushed, .. } = self.surface;
         match &self.shape {
             Shape::Block { size_mm, squares, square_mm } if squares[0] > 0 && p.z > 0.5 * size_mm[2] - 1e-6 => {
                 let i = (p.x / square_mm + 0.5 * f64::from(squares[0])).floor();
@@ -170,18 +136,6 @@ impl Body {
             _ => albedo,
         }
     }
-}
-
-/// The smaller root of `a t² + 2 b t + c = 0`, where there is one: the way into a convex body.
-#[inline]
-pub(super) fn entry(a: f64, b: f64, c: f64) -> Option<f64> {
-    let disc = b * b - a * c;
-    if !(disc >= 0.0 && a > 0.0) {
-        return None;
-    }
-    // Of the two forms the one without cancellation.
-    let root = disc.sqrt();
-    Some(if b < 0.0 { c / (root - b) } else { (-b - root) / a })
 }
 
 fn sphere(ray: &Ray, radius: f64, after: f64) -> Option<Hit> {
@@ -217,18 +171,4 @@ fn stem(ray: &Ray, radius: f64, length: f64, after: f64) -> Option<Hit> {
     let t = entry(d.x * d.x + d.y * d.y, o.x * d.x + o.y * d.y, o.x * o.x + o.y * o.y - radius * radius)?;
     let p = ray.at(t);
     (t > after && (0.0..=length).contains(&p.z)).then(|| Hit { t, normal: Vec3::new(p.x, p.y, 0.0) / radius, part: 0 })
-}
-
-/// Noise of -1 to 1 that is smooth over a distance of one and repeats after `period` in x.
-pub(super) fn smooth_noise(x: f64, y: f64, period: f64) -> f64 {
-    let (i, j) = (x.floor(), y.floor());
-    let ease = |f: f64| f * f * (3.0 - 2.0 * f);
-    let (u, v) = (ease(x - i), ease(y - j));
-    let node = |di: f64, dj: f64| {
-        let key = ((i + di).rem_euclid(period) as u64) << 32 ^ ((j + dj) as i64 as u64 & 0xffff_ffff);
-        (super::mix(key) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
-    };
-    let (low, high) =
-        (node(0.0, 0.0) * (1.0 - u) + node(1.0, 0.0) * u, node(0.0, 1.0) * (1.0 - u) + node(1.0, 1.0) * u);
-    low * (1.0 - v) + high * v
 }

@@ -4,13 +4,13 @@ use std::f64::consts::PI;
 
 use rayon::prelude::*;
 
-use super::{Part, Surface};
-use crate::Vec3;
-use crate::memory::require;
+use super::super::ray::Ray;
+use super::surface::{WeldPart, WeldSurface};
+use crate::ground::memory::require;
+use crate::ground::stop::polled;
+use crate::ground::threads;
+use crate::ground::transform::{Transform, Vec3};
 use crate::scanner::Scanner;
-use crate::stop::polled;
-use crate::threads;
-use crate::transform::Transform;
 
 /// The march along a ray takes slopes up to this for granted; steeper ones (the toes of an elliptic cap, drops) may lose
 /// a corner that hides a part of them.
@@ -85,16 +85,9 @@ const NOTHING: Seen = Seen {
 /// What every pixel found, row-major.
 pub type Cast = Vec<Seen>;
 
-/// A ray in the weld's frame; its direction has unit length.
-#[derive(Clone, Copy)]
-struct Ray {
-    origin: Vec3,
-    direction: Vec3,
-}
-
 /// A place on a ray: how high it is above the surface, and where.
 #[derive(Clone, Copy)]
-struct Place {
+struct RayPlace {
     above: f64,
     /// Height of the surface over the nominal radius.
     height: f64,
@@ -102,36 +95,20 @@ struct Place {
     z: f64,
     /// Cosine and sine of the angle.
     outward: [f64; 2],
-    part: Part,
+    part: WeldPart,
 }
 
-impl Ray {
+impl WeldSurface {
     #[inline]
-    fn at(&self, t: f64) -> Vec3 {
-        self.origin + self.direction * t
-    }
-
-    /// Where it goes into and out of the cylinder of that radius.
-    #[inline]
-    fn through(&self, radius: f64) -> Option<(f64, f64)> {
-        let (o, d) = (&self.origin, &self.direction);
-        let (a, b) = (d.x * d.x + d.y * d.y, o.x * d.x + o.y * d.y);
-        let disc = b * b - a * (o.x * o.x + o.y * o.y - radius * radius);
-        (disc > 0.0 && a > 0.0).then(|| ((-b - disc.sqrt()) / a, (-b + disc.sqrt()) / a))
-    }
-}
-
-impl Surface {
-    #[inline]
-    fn place(&self, p: &Vec3) -> Place {
+    fn place(&self, p: &Vec3) -> RayPlace {
         let rho = (p.x * p.x + p.y * p.y).sqrt();
         let (angle, outward) = (p.y.atan2(p.x), [p.x / rho, p.y / rho]);
         let (height, part) = self.height_towards((angle, outward), p.z);
-        Place { above: rho - self.scene.radius_mm - height, height, angle, z: p.z, outward, part }
+        RayPlace { above: rho - self.scene.radius_mm - height, height, angle, z: p.z, outward, part }
     }
 
     /// The first place where a ray from outside meets the surface.
-    fn meet(&self, ray: &Ray) -> Option<(f64, Place)> {
+    fn meet(&self, ray: &Ray) -> Option<(f64, RayPlace)> {
         let (start, other_side) = ray.through(self.scene.radius_mm + self.top_mm)?;
         if start <= 0.0 {
             return None;
@@ -162,7 +139,7 @@ impl Surface {
     }
 
     /// The root between a place above and a place below the surface: regula falsi (Illinois).
-    fn pin(&self, ray: &Ray, (mut a, above): (f64, Place), (mut b, below): (f64, Place)) -> (f64, Place) {
+    fn pin(&self, ray: &Ray, (mut a, above): (f64, RayPlace), (mut b, below): (f64, RayPlace)) -> (f64, RayPlace) {
         let (mut fa, mut fb) = (above.above, below.above);
         let mut best = (b, below);
         let mut side = 0;
@@ -187,7 +164,7 @@ impl Surface {
     }
 
     /// The outward normal at a place of the surface.
-    fn normal(&self, place: &Place) -> Vec3 {
+    fn normal(&self, place: &RayPlace) -> Vec3 {
         let turn = DIFFERENCE_MM / (self.scene.radius_mm + place.height);
         let around = (self.height(place.angle + turn, place.z).0 - place.height) / DIFFERENCE_MM;
         let beside = self.height_towards((place.angle, place.outward), place.z + DIFFERENCE_MM).0;
@@ -197,7 +174,7 @@ impl Surface {
     }
 
     /// Whether something of the weld stands between a point of the surface and the lamp.
-    fn shaded(&self, p: &Vec3, place: &Place, to_lamp: &Vec3) -> bool {
+    fn shaded(&self, p: &Vec3, place: &RayPlace, to_lamp: &Vec3) -> bool {
         let ray = Ray { origin: *p, direction: *to_lamp };
         let up = ray.direction.x * place.outward[0] + ray.direction.y * place.outward[1];
         let aside = (1.0 - up * up).max(0.0).sqrt();

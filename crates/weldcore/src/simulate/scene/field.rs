@@ -5,11 +5,11 @@ use std::f64::consts::TAU;
 
 use rayon::prelude::*;
 
-use super::super::{mix, normals};
 use crate::error::{Error, Result};
-use crate::memory::require;
-use crate::stop::polled;
-use crate::threads;
+use crate::ground::memory::require;
+use crate::ground::random::{mix, normals};
+use crate::ground::stop::polled;
+use crate::ground::threads;
 
 /// Nodes per correlation length: the spline then follows the field to a thousandth of its sd.
 const NODES_PER_LENGTH: f64 = 5.0;
@@ -42,12 +42,12 @@ pub struct Wander {
 
 /// Weights of white noise for one direction, normalised so that the spline has unit variance.
 #[derive(Debug, Clone)]
-struct Kernel {
+struct Smoothing {
     taps: Vec<f64>,
     reach: usize,
 }
 
-impl Kernel {
+impl Smoothing {
     /// `length` is the correlation length in node distances.
     fn new(length: f64) -> Self {
         // White noise under a Gaussian of variance L²/2 has the covariance exp(-½ (d/L)²); the cubic spline itself
@@ -136,8 +136,8 @@ impl Field {
         }
         require(around * (along + 64), 40);
         let per_rad = around as f64 / TAU;
-        let ring = Kernel::new(of.around_mm * per_rad / radius_mm).normalised(around);
-        let line = Kernel::new(of.along_mm * per_mm).normalised(0);
+        let ring = Smoothing::new(of.around_mm * per_rad / radius_mm).normalised(around);
+        let line = Smoothing::new(of.along_mm * per_mm).normalised(0);
         // Rows beyond both ends feed the kernel.
         let row = |i: usize| -> Vec<f64> {
             ring.closed(&(0..around).map(|j| noise(seed, i * around + j)).collect::<Vec<_>>())
@@ -189,7 +189,7 @@ impl Curve {
         }
         let count = nodes_around(radius_mm, of.length_mm);
         let per_rad = count as f64 / TAU;
-        let kernel = Kernel::new(of.length_mm * per_rad / radius_mm).normalised(count);
+        let kernel = Smoothing::new(of.length_mm * per_rad / radius_mm).normalised(count);
         let nodes = kernel.closed(&(0..count).map(|j| of.sd_mm * noise(seed, j)).collect::<Vec<_>>());
         Self { per_rad, nodes }
     }

@@ -1,9 +1,13 @@
 //! The surface and the rays against closed forms.
 
+use std::f64::consts::TAU;
+
+use super::description::*;
+use super::surface::*;
 use super::*;
-use crate::Vec3;
+use crate::error::Error;
+use crate::ground::transform::{Transform, Vec3};
 use crate::scanner::{Lens, Scanner};
-use crate::transform::Transform;
 
 const STILL: Wander = Wander { sd_mm: 0.0, length_mm: 20.0 };
 
@@ -29,8 +33,8 @@ fn scene(radius_mm: f64) -> Scene {
         radius_mm,
         thickness_mm: 6.0,
         half_length_mm: 120.0,
-        reference: Wall::default(),
-        other: Wall::default(),
+        reference: SceneWall::default(),
+        other: SceneWall::default(),
         cap: cap(11.0, 1.7),
         seam_mm: 0.0,
         seam_wander: STILL,
@@ -40,10 +44,10 @@ fn scene(radius_mm: f64) -> Scene {
     }
 }
 
-fn surface(change: impl FnOnce(&mut Scene)) -> Surface {
+fn surface(change: impl FnOnce(&mut Scene)) -> WeldSurface {
     let mut scene = scene(315.0);
     change(&mut scene);
-    Surface::new(scene).unwrap()
+    WeldSurface::new(scene).unwrap()
 }
 
 fn uneven(sd_mm: f64) -> Vec<Unevenness> {
@@ -93,7 +97,7 @@ fn the_step_of_two_round_pipes_is_that_of_their_circles() {
 
 #[test]
 fn machined_flared_and_dented_edges_are_as_deep_as_they_were_made() {
-    let at = |change: &dyn Fn(&mut Wall)| surface(|s| change(&mut s.other));
+    let at = |change: &dyn Fn(&mut SceneWall)| surface(|s| change(&mut s.other));
     let taper = at(&|w| w.taper = Some(Taper { depth_mm: 1.6, slope: 0.1 }));
     assert!((taper.edges(1.0).step_mm() + 1.6).abs() < 1e-12);
     assert!((taper.height(1.0, 5.5 + 6.0).0 + 1.0).abs() < 1e-12 && taper.height(1.0, 22.0).0 == 0.0);
@@ -147,9 +151,12 @@ fn a_ring_between_two_welds_has_its_own_height() {
         let edges = surface.edges(2.0);
         assert!((edges.step_mm() - sign * 1.6).abs() < 1e-12);
         assert!((edges.second_step_mm + 1.6).abs() < 1e-12);
-        assert_eq!(surface.height(2.0, sign * 15.0), (1.6, if sign > 0.0 { Part::Other } else { Part::Reference }));
+        assert_eq!(
+            surface.height(2.0, sign * 15.0),
+            (1.6, if sign > 0.0 { WeldPart::Other } else { WeldPart::Reference })
+        );
         let (top, part) = surface.height(2.0, sign * 30.0);
-        assert!((top - 0.8 - 1.5).abs() < 1e-12 && part == Part::SecondCap);
+        assert!((top - 0.8 - 1.5).abs() < 1e-12 && part == WeldPart::SecondCap);
         assert_eq!(surface.height(2.0, sign * 36.0).0, 0.0);
     }
 }
@@ -263,11 +270,11 @@ fn a_cast_has_the_same_bits_on_any_number_of_threads() {
     let (scanner, pose) = scanner();
     let mut seen = Vec::new();
     for n in [1, 2, 5] {
-        crate::threads::set_threads(Some(n)).unwrap();
+        crate::ground::threads::set_threads(Some(n)).unwrap();
         let bits = build().cast(&scanner, &pose);
         seen.push(bits.iter().map(|s| (s.depth_mm.to_bits(), s.column_px.to_bits())).collect::<Vec<_>>());
     }
-    crate::threads::set_threads(None).unwrap();
+    crate::ground::threads::set_threads(None).unwrap();
     assert!(seen.windows(2).all(|w| w[0] == w[1]));
 }
 
@@ -276,7 +283,7 @@ fn scenes_that_cannot_be_are_refused() {
     let refused = |change: &dyn Fn(&mut Scene)| {
         let mut scene = scene(315.0);
         change(&mut scene);
-        Surface::new(scene).unwrap_err()
+        WeldSurface::new(scene).unwrap_err()
     };
     assert!(matches!(refused(&|s| s.radius_mm = 0.0), Error::OutOfRange { what: "scene radius_mm", .. }));
     assert!(matches!(refused(&|s| s.cap.crown = 1.0), Error::OutOfRange { what: "cap crown", .. }));

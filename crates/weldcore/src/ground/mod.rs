@@ -1,0 +1,10 @@
+//! What every room stands on: threads, memory, ending a call, random numbers, robust statistics, images, transforms.
+
+pub mod allocator;
+pub mod image;
+pub mod memory;
+pub mod random;
+pub mod robust;
+pub mod stop;
+pub mod threads;
+pub mod transform;

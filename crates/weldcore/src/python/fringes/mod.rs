@@ -1,0 +1,16 @@
+//! Decoding and unwrapping as Python sees them.
+
+pub(crate) mod decode;
+pub(crate) mod images;
+pub(crate) mod response;
+mod unwrap;
+pub(crate) mod wrapped;
+
+use pyo3::prelude::*;
+
+pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    decode::register(m)?;
+    wrapped::register(m)?;
+    response::register(m)?;
+    unwrap::register(m)
+}

@@ -1,0 +1,11 @@
+//! Camera and projector as Python sees them.
+
+pub(crate) mod lens;
+pub(crate) mod triangulate;
+
+use pyo3::prelude::*;
+
+pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    lens::register(m)?;
+    triangulate::register(m)
+}

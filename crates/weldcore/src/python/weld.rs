@@ -1,0 +1,343 @@
+//! Segmentation and step for Python: the two calls of `weldscan.measure.inspection`.
+
+use numpy::{
+    IntoPyArray, Ix3, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArrayDyn,
+    PyUntypedArrayMethods,
+};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::error::Error;
+use crate::ground::transform::Vec3;
+use crate::python::call::{compute, raise};
+use crate::python::convert::vector;
+use crate::python::convert::{Whole, floats, parts};
+use crate::weld::Nominal;
+use crate::weld::place::{self, Scan};
+use crate::weld::sections::Station;
+use crate::weld::segment::{self, Segmentation};
+use crate::weld::step::{self, Known, LabelledShot};
+
+/// One part shot, cut into reference wall, other wall and bead (see `segment_weld`).
+#[pyclass(frozen, module = "weldscan")]
+pub(crate) struct WeldShot(pub(crate) Segmentation);
+
+#[pymethods]
+impl WeldShot {
+    /// (3,) float64, mm: on the axis at the seam's centreline, frame of the points.
+    #[getter]
+    fn origin_mm<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        PyArray1::from_slice(py, self.0.frame.origin_mm.as_slice())
+    }
+    /// (3,) float64, unit: from the reference wall to the other wall.
+    #[getter]
+    fn axis<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        PyArray1::from_slice(py, self.0.frame.axis.as_slice())
+    }
+    /// (3,) float64, unit: towards angle 0.
+    #[getter]
+    fn zero<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        PyArray1::from_slice(py, self.0.frame.zero.as_slice())
+    }
+    /// Radius of the reference wall, mm.
+    #[getter]
+    fn radius_mm(&self) -> f64 {
+        self.0.frame.radius_mm
+    }
+    /// Whether the radius was fitted; False: the arc is too short for that and the nominal one was used.
+    #[getter]
+    fn radius_fitted(&self) -> bool {
+        self.0.radius_fitted
+    }
+    /// Noise of one point across the wall, mm (robust, 1 sigma).
+    #[getter]
+    fn noise_mm(&self) -> f64 {
+        self.0.noise_mm
+    }
+    /// Mean distance between the weld's toes, mm.
+    #[getter]
+    fn bead_width_mm(&self) -> f64 {
+        self.0.bead_width_mm
+    }
+    /// (H * W,) uint8: `weldscan.result.Label` per pixel.
+    #[getter]
+    fn labels<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u8>> {
+        PyArray1::from_slice(py, &self.0.labels)
+    }
+    /// (H * W,) float32, rad, in [-pi, pi]; NaN without a point.
+    #[getter]
+    fn angle_rad<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
+        PyArray1::from_slice(py, &self.0.unrolled.angle_rad)
+    }
+    /// (H * W,) float32, mm from the seam's centreline; the reference wall is negative.
+    #[getter]
+    fn axial_mm<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
+        PyArray1::from_slice(py, &self.0.unrolled.axial_mm)
+    }
+    /// (H * W,) float32, mm: radial deviation from the reference wall's cylinder.
+    #[getter]
+    fn deviation_mm<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
+        PyArray1::from_slice(py, &self.0.unrolled.deviation_mm)
+    }
+    /// (H * W,) uint8: what became of each point: 0 none, 1 wall, 2 transition, 3 cap, 4 gated, 5 off line, 6 other.
+    #[getter]
+    fn fates<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u8>> {
+        PyArray1::from_slice(py, &self.0.fates)
+    }
+    /// The cross-sections along the seam: a dict of arrays over the stations (n,), NaN for what is not known: `angle_deg`
+    /// (middle of the station, [0, 360)), `seen` (bool), `kind` (uint8: 0 unknown, 1 raised, 2 hollow, 3 flush), `by_course` (bool: the
+    /// toes are those of the seam's course), `toes_mm` (n, 2) from the seam's centreline, reference side first, `height_mm` of
+    /// the cap, `edge_step_mm` (other over reference, right beside the toes), `edge_standard_mm` (k = 1), `edge_hull_mm` (what the
+    /// choice of the toes may hide, in full), `undisturbed_mm` (n, 2): from where outward the walls are undisturbed,
+    /// `departure_mm` (n, 2): of the transition from the straight wall, `wall_step_mm` of both straight walls.
+    #[getter]
+    fn sections<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let stations = &self.0.sections.stations;
+        let out = PyDict::new(py);
+        let one = |pick: &dyn Fn(&Station) -> Option<f64>| -> Bound<'py, PyArray1<f64>> {
+            stations.iter().map(|s| pick(s).unwrap_or(f64::NAN)).collect::<Vec<f64>>().into_pyarray(py)
+        };
+        let two = |pick: &dyn Fn(&Station) -> [Option<f64>; 2]| -> PyResult<Bound<'py, PyArray2<f64>>> {
+            let flat: Vec<f64> = stations.iter().flat_map(|s| pick(s).map(|v| v.unwrap_or(f64::NAN))).collect();
+            flat.into_pyarray(py).reshape([stations.len(), 2])
+        };
+        out.set_item("angle_deg", one(&|s| Some(s.angle_rad.to_degrees().rem_euclid(360.0))))?;
+        out.set_item("seen", stations.iter().map(|s| s.seen).collect::<Vec<bool>>().into_pyarray(py))?;
+        out.set_item("kind", stations.iter().map(|s| s.kind as u8).collect::<Vec<u8>>().into_pyarray(py))?;
+        out.set_item("by_course", stations.iter().map(|s| s.by_course).collect::<Vec<bool>>().into_pyarray(py))?;
+        out.set_item("toes_mm", two(&|s| s.toes_mm.map_or([None; 2], |t| t.map(Some)))?)?;
+        out.set_item("height_mm", one(&|s| s.toes_mm.map(|_| s.height_mm)))?;
+        out.set_item("edge_step_mm", one(&|s| s.edge.map(|e| e.step_mm)))?;
+        out.set_item("edge_standard_mm", one(&|s| s.edge.map(|e| e.standard_mm)))?;
+        out.set_item("edge_hull_mm", one(&|s| s.edge.map(|e| e.hull_mm)))?;
+        out.set_item("undisturbed_mm", two(&|s| s.undisturbed_mm)?)?;
+        out.set_item("departure_mm", two(&|s| s.departure_mm.map(Some))?)?;
+        out.set_item("wall_step_mm", one(&|s| s.wall_step_mm))?;
+        Ok(out)
+    }
+    /// Length of a station of `sections` along the seam, mm.
+    #[getter]
+    fn station_mm(&self) -> f64 {
+        self.0.sections.station_mm
+    }
+    /// Why the weld's edges may not be what they seem: a list of (code, angle in degrees, text).
+    #[getter]
+    fn doubts(&self) -> Vec<(&'static str, f64, String)> {
+        let doubts = self.0.sections.doubts.iter();
+        doubts.map(|d| (d.code, d.angle_rad.to_degrees().rem_euclid(360.0), d.text.clone())).collect()
+    }
+    fn __repr__(&self) -> String {
+        let count = |l: u8| self.0.labels.iter().filter(|x| **x == l).count();
+        format!("WeldShot(reference_wall={}, other_wall={}, bead={})", count(1), count(2), count(3))
+    }
+}
+
+fn direction(py: Python<'_>, what: &'static str, given: Option<&Bound<'_, PyAny>>) -> PyResult<Option<Vec3>> {
+    let Some(given) = given else { return Ok(None) };
+    let v = Vec3::from(vector(what, given)?);
+    match v.try_normalize(0.0).filter(|u| u.iter().all(|c| c.is_finite())) {
+        Some(u) => Ok(Some(u)),
+        None => Err(raise(py, &Error::Degenerate { what, reason: "it has no direction".into() })),
+    }
+}
+
+/// Cuts one part shot into reference wall, other wall and bead, without seeds.
+///
+/// points_mm: (H, W, 3) float64, NaN where there is no point, one frame (the scanner's: the scanner stands at its origin).
+/// radius_mm, wall_thickness_mm: the pipe's nominal ones. axis: (3,), from the reference wall to the other wall, in the
+/// frame of the points, within some degrees; None: from the points. zero: (3,), towards angle 0; None: angle 0 faces the
+/// scanner. Returns a WeldShot. Raises InputError on bad arguments, GeometryError with the reason where no weld or
+/// only one wall is in view. Source: `crates/weldcore/src/segment.rs`.
+#[pyfunction]
+#[pyo3(signature = (points_mm, radius_mm, wall_thickness_mm, axis=None, zero=None))]
+fn segment_weld(
+    py: Python<'_>,
+    points_mm: &Bound<'_, PyAny>,
+    radius_mm: f64,
+    wall_thickness_mm: f64,
+    axis: Option<&Bound<'_, PyAny>>,
+    zero: Option<&Bound<'_, PyAny>>,
+) -> PyResult<WeldShot> {
+    let points_mm = floats::<Ix3>("points_mm", points_mm)?;
+    let shape = points_mm.shape().to_vec();
+    let wrong = |got: String| {
+        let expected = "an array of shape (H, W, 3)".into();
+        raise(py, &Error::Shape { what: "points_mm", expected, got })
+    };
+    if shape[2] != 3 {
+        return Err(wrong(format!("shape {shape:?}")));
+    }
+    let points = points_mm.as_slice().map_err(|_| wrong("strided".into()))?.as_chunks::<3>().0;
+    let nominal = Nominal {
+        radius_mm,
+        wall_thickness_mm,
+        axis: direction(py, "axis", axis)?,
+        zero: direction(py, "zero", zero)?,
+    };
+    compute(py, || segment::segment(points, shape[1], &nominal)).map(WeldShot)
+}
+
+/// The columns of the profile that `measure_step` returns.
+const PROFILE_COLUMNS: [&str; 9] =
+    ["angle_deg", "seen_at_deg", "step_mm", "standard_mm", "fit_mm", "toe_mm", "local_mm", "angle_mm", "unevenness_mm"];
+
+/// Measures the step of the other wall over the reference wall on all shots together.
+///
+/// shots: a list of WeldShot. angle_sigma_rad: standard uncertainty of the angle about the axis (k = 1). Returns a dict: `mean_mm, median_mm` over the other wall's points, `max_abs_mm, max_abs_at_deg, expanded_mm`
+/// (k = 2) over the profile, `profile` (n, 9) float64 with the columns `profile_columns`: angle_deg, seen_at_deg,
+/// step_mm, standard_mm and its parts (k = 1); `coverage_deg`, `deviation_mm` (a (H * W,) float32 array per shot, from the
+/// corrected reference wall), and the model's parameters. Raises GeometryError where the walls do not determine it.
+/// Source: `crates/weldcore/src/step.rs`.
+#[pyfunction]
+#[pyo3(signature = (shots, angle_sigma_rad=0.0))]
+fn measure_step<'py>(
+    py: Python<'py>,
+    shots: Vec<PyRef<'py, WeldShot>>,
+    angle_sigma_rad: f64,
+) -> PyResult<Bound<'py, PyDict>> {
+    let views: Vec<LabelledShot> = shots
+        .iter()
+        .map(|s| LabelledShot {
+            angle_rad: &s.0.unrolled.angle_rad,
+            axial_mm: &s.0.unrolled.axial_mm,
+            deviation_mm: &s.0.unrolled.deviation_mm,
+            labels: &s.0.labels,
+            radius_mm: s.0.frame.radius_mm,
+            bead_width_mm: s.0.bead_width_mm,
+            thickness_mm: s.0.thickness_mm,
+        })
+        .collect();
+    let known = Known { angle_rad: angle_sigma_rad };
+    let step = compute(py, || step::measure(&views, &known))?;
+    let out = PyDict::new(py);
+    out.set_item("mean_mm", step.mean_mm)?;
+    out.set_item("median_mm", step.median_mm)?;
+    out.set_item("max_abs_mm", step.max_abs_mm)?;
+    out.set_item("max_abs_at_deg", step.max_abs_at_deg)?;
+    out.set_item("expanded_mm", step.expanded_mm)?;
+    out.set_item("coverage_deg", step.coverage_deg)?;
+    out.set_item("radius_difference_mm", step.radius_difference_mm)?;
+    out.set_item("axis_offset_mm", step.axis_offset_mm)?;
+    out.set_item("axis_offset_standard_mm", step.axis_offset_standard_mm)?;
+    out.set_item("tilt_rad", step.tilt_rad)?;
+    out.set_item("tilt_standard_rad", step.tilt_standard_rad)?;
+    out.set_item("shape_degree", step.shape_degree)?;
+    out.set_item("shrinkage_mm", step.shrinkage_mm)?;
+    out.set_item("residual_rms_mm", step.residual_rms_mm)?;
+    out.set_item("correlation_mm", step.correlation_mm)?;
+    out.set_item("effective_cells", step.effective_cells)?;
+    out.set_item("profile_columns", PROFILE_COLUMNS.to_vec())?;
+    let rows: Vec<Vec<f64>> = step
+        .profile
+        .iter()
+        .map(|b| {
+            let parts = [b.fit_mm, b.toe_mm, b.local_mm, b.angle_mm, b.unevenness_mm];
+            [b.angle_deg, b.seen_at_deg, b.step_mm, b.standard_mm].into_iter().chain(parts).collect()
+        })
+        .collect();
+    let profile = PyArray2::from_vec2(py, &rows)
+        .map_err(|e| crate::python::call::raise_as(py, "WeldscanError", e.to_string()))?;
+    out.set_item("profile", profile)?;
+    let deviations: Vec<_> = step.deviation_mm.into_iter().map(|d| d.into_pyarray(py)).collect();
+    out.set_item("deviation_mm", deviations)?;
+    Ok(out)
+}
+
+/// A shot's points, float64 of n x 3 whatever its shape, as the core's points.
+fn flat<'a>(py: Python<'_>, array: &'a PyReadonlyArrayDyn<'_, f64>) -> PyResult<&'a [[f64; 3]]> {
+    let wrong = |got: String| {
+        let expected = "a C-contiguous float64 array of shape (..., 3)".into();
+        raise(py, &Error::Shape { what: "points_mm", expected, got })
+    };
+    if array.shape().last() != Some(&3) {
+        return Err(wrong(format!("shape {:?}", array.shape())));
+    }
+    Ok(array.as_slice().map_err(|_| wrong("strided".into()))?.as_chunks::<3>().0)
+}
+
+/// The arrays of `place_shots`: points, labels, deviation, angle, axial, shot.
+type PlacedArrays<'py> = (
+    Bound<'py, PyArray2<f64>>,
+    Bound<'py, PyArray1<u8>>,
+    Bound<'py, PyArray1<f32>>,
+    Bound<'py, PyArray1<f32>>,
+    Bound<'py, PyArray1<f32>>,
+    Bound<'py, PyArray1<u16>>,
+);
+
+/// Joins segmented shots into one cloud in base.
+///
+/// shots: list of (WeldShot, points_mm (H, W, 3) float64 in the scanner's frame, base_from_scanner (4, 4) float64,
+/// deviation_mm (H * W,) float32, number). Points whose deviation is NaN are left out. Returns arrays over the points that
+/// remain, in order of the shots and pixels: points_mm (n, 3) float64 in base, label uint8, deviation_mm float32,
+/// angle_deg float32 in [0, 360), axial_mm float32, shot uint16. Raises InputError for arrays that do not belong together.
+/// Source: `crates/weldcore/src/place.rs`.
+#[pyfunction]
+fn place_shots<'py>(py: Python<'py>, shots: &Bound<'py, PyAny>) -> PyResult<PlacedArrays<'py>> {
+    let expected = "a list of (WeldShot, points_mm, base_from_scanner, deviation_mm, number)";
+    let shots: Vec<PlacedShot<'py>> = parts("shots", expected, shots)?;
+    let mut scans = Vec::with_capacity(shots.len());
+    for (shot, points, base_from_scanner, deviation, number) in &shots {
+        let wrong =
+            |_| raise(py, &Error::Shape { what: "deviation_mm", expected: "contiguous".into(), got: "strided".into() });
+        scans.push(Scan {
+            points: flat(py, points)?,
+            base_from_scanner: crate::python::convert::transform("base_from_scanner", base_from_scanner)?,
+            unrolled: &shot.0.unrolled,
+            labels: &shot.0.labels,
+            deviation_mm: deviation.as_slice().map_err(wrong)?,
+            shot: u16::try_from(number.0).map_err(|_| {
+                let expected = "0 to 65535".into();
+                raise(py, &Error::OutOfRange { what: "number of a shot", expected, value: number.0.to_string() })
+            })?,
+        });
+    }
+    let placed = compute(py, || place::place(&scans))?;
+    let points = placed.points.into_pyarray(py).reshape([placed.labels.len(), 3])?;
+    Ok((
+        points,
+        placed.labels.into_pyarray(py),
+        placed.deviation_mm.into_pyarray(py),
+        placed.angle_deg.into_pyarray(py),
+        placed.axial_mm.into_pyarray(py),
+        placed.shot.into_pyarray(py),
+    ))
+}
+
+type PlacedShot<'py> =
+    (PyRef<'py, WeldShot>, PyReadonlyArrayDyn<'py, f64>, PyReadonlyArray2<'py, f64>, PyReadonlyArray1<'py, f32>, Whole);
+
+/// The tables of `seam_fates`.
+type Tables<'py> = (Bound<'py, PyArray2<u32>>, Bound<'py, PyArray2<u32>>);
+
+/// Counts what became of every pixel of a part shot, bin by bin along the seam.
+///
+/// shot: WeldShot. reason: (H, W) uint8, as `PhaseMap.reason`. scanner: whose camera took it. Returns two (180, 12) uint32
+/// arrays over the bins of 2 degrees (centred on even ones) and `weldscan.result.FATES`: of all pixels, and of those on the
+/// weld and within 8 mm of its toes. A pixel without a point lies where its ray meets the reference wall's cylinder. Raises
+/// InputError where the arrays are not those of one image. Source: `crates/weldcore/src/seam_fates.rs`.
+#[pyfunction]
+fn seam_fates<'py>(
+    py: Python<'py>,
+    shot: PyRef<'py, WeldShot>,
+    reason: PyReadonlyArray2<'py, u8>,
+    scanner: PyRef<'py, crate::python::scanner::lens::PyScanner>,
+) -> PyResult<Tables<'py>> {
+    let strided = |_| raise(py, &Error::Shape { what: "reason", expected: "contiguous".into(), got: "strided".into() });
+    let reasons = reason.as_slice().map_err(strided)?;
+    let (shot, camera) = (&shot.0, &scanner.scanner.camera);
+    let found = compute(py, || crate::weld::seam_fates::seam_fates(shot, reasons, camera))?;
+    let table = |rows: Vec<[u32; crate::weld::seam_fates::FATES]>| {
+        let n = rows.len();
+        rows.into_flattened().into_pyarray(py).reshape([n, crate::weld::seam_fates::FATES])
+    };
+    Ok((table(found.all)?, table(found.near)?))
+}
+
+pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_function(wrap_pyfunction!(seam_fates, m)?)?;
+    m.add_class::<WeldShot>()?;
+    m.add_function(wrap_pyfunction!(segment_weld, m)?)?;
+    m.add_function(wrap_pyfunction!(measure_step, m)?)?;
+    m.add_function(wrap_pyfunction!(place_shots, m)?)
+}

@@ -1,0 +1,7 @@
+//! Camera and projector: their lenses, and the points that they see together.
+
+pub mod lens;
+pub mod reference_plane;
+pub mod triangulate;
+
+pub use lens::{Axis, Lens, Rays, Scanner};

@@ -1,0 +1,167 @@
+//! A pipe of known size found in a shot, roughly: what the walls are then sought in.
+
+use nalgebra::Matrix3;
+use rayon::prelude::*;
+
+use super::pipe_frame::PipeFrame;
+use crate::error::{Error, Result, require_count};
+use crate::ground::robust::median;
+use crate::ground::stop::polled;
+use crate::ground::threads;
+use crate::ground::transform::Vec3;
+
+/// Normals that the coarse frame is found from.
+const COARSE_POINTS: f64 = 20_000.0;
+
+/// What is known of the part before it is scanned, in the frame of the points.
+#[derive(Debug, Clone, Copy)]
+pub struct Nominal {
+    /// Outer radius of the pipe.
+    pub radius_mm: f64,
+    /// Of the pipe.
+    pub wall_thickness_mm: f64,
+    /// From the reference wall to the other wall; without it the axis comes from the points, and points to the right of
+    /// the image (or down, where it runs so).
+    pub axis: Option<Vec3>,
+    /// Towards angle 0; without it angle 0 faces the scanner.
+    pub zero: Option<Vec3>,
+}
+
+/// The normal at pixel (row, column) from its neighbours `reach` away, towards the scanner; `None` at holes and edges.
+fn normal(points: &[[f64; 3]], width: usize, row: usize, column: usize, reach: usize) -> Option<Vec3> {
+    let at = |r: usize, c: usize| points.get(r * width + c).map(|p| Vec3::from(*p)).filter(|p| p.x.is_finite());
+    let (up, left) = (row.checked_sub(reach)?, column.checked_sub(reach)?);
+    let right = (column + reach < width).then_some(column + reach)?;
+    let here = at(row, column)?;
+    let n =
+        (at(row, right)? - at(row, left)?).cross(&(at(row + reach, column)? - at(up, column)?)).try_normalize(0.0)?;
+    Some(if n.dot(&here) > 0.0 { -n } else { n })
+}
+
+/// A cylinder of the nominal radius near the points: axis from the normals, place from a vote of `p - R n`, both then
+/// refined with the points that agree. Degrees and millimetres suffice.
+pub(super) fn coarse_frame(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<PipeFrame> {
+    // Normals over a twentieth of the radius, at most: the surface must be nearly flat there, and longer is less noisy.
+    let height = points.len() / width;
+    let stride = ((points.len() as f64 / COARSE_POINTS).sqrt() as usize).max(1);
+    let reach = (width.min(height) / 100).clamp(1, 8);
+    let rows: Vec<usize> = (0..height).step_by(stride).collect();
+    let found: Vec<Vec<(Vec3, Vec3)>> = threads::install(|| {
+        rows.par_iter()
+            .inspect(polled)
+            .map(|&r| {
+                let pick = |c| Some((Vec3::from(points[r * width + c]), normal(points, width, r, c, reach)?));
+                (0..width).step_by(stride).filter_map(pick).collect()
+            })
+            .collect()
+    });
+    let seen: Vec<(Vec3, Vec3)> = found.into_iter().flatten().collect();
+    require_count("part points with a normal", 100, seen.len())?;
+    let axis = axis_from_normals(&seen, nominal.axis)?;
+    let middle = seen.iter().map(|(p, _)| p).sum::<Vec3>() / seen.len() as f64;
+    let zero = nominal.zero.unwrap_or_else(|| {
+        // Towards the scanner, which is at the origin of its own frame.
+        let view = -middle;
+        view - axis * axis.dot(&view)
+    });
+    let radius = nominal.radius_mm;
+    let mut frame = PipeFrame::new(middle, axis, zero, radius)?;
+    frame.origin_mm = vote_centre(&seen, &frame);
+    refine_centre(&seen, &mut frame);
+    Ok(frame)
+}
+
+/// The direction to which the normals are most square, started at `prior` and reweighted, with its sign.
+fn axis_from_normals(seen: &[(Vec3, Vec3)], prior: Option<Vec3>) -> Result<Vec3> {
+    let mut axis = prior.map(|a| a.normalize());
+    let mut told = false;
+    for _ in 0..6 {
+        // Flanks of the bead and rubbish lean towards the axis: weight them down by what is usual.
+        let scale = axis.map(|a| {
+            let mut lean: Vec<f64> = seen.iter().map(|(_, n)| n.dot(&a).abs()).collect();
+            3.0 * 1.4826 * median(&mut lean).max(1e-3)
+        });
+        let mut spread = Matrix3::zeros();
+        for (_, n) in seen {
+            let w = match (axis, scale) {
+                (Some(a), Some(s)) => tukey(n.dot(&a) / s),
+                _ => 1.0,
+            };
+            spread += n * n.transpose() * w;
+        }
+        let eigen = spread.symmetric_eigen();
+        let mut order = [0, 1, 2];
+        order.sort_by(|&i, &j| eigen.eigenvalues[i].total_cmp(&eigen.eigenvalues[j]));
+        // On a short arc the normals hardly turn about the axis; then only what is known beforehand tells the axis.
+        told = eigen.eigenvalues[order[1]] > 4.0 * eigen.eigenvalues[order[0]];
+        if !told && prior.is_some() {
+            break;
+        }
+        axis = Some(eigen.eigenvectors.column(order[0]).into());
+    }
+    let Some(axis) = axis.filter(|_| told || prior.is_some()) else {
+        let reason = "the arc in view is too short to show the pipe's axis; give part.axis_base".into();
+        return Err(Error::Degenerate { what: "pipe axis", reason });
+    };
+    let sign = match prior {
+        Some(p) => axis.dot(&p),
+        None if axis.x.abs() >= axis.y.abs() => axis.x,
+        None => axis.y,
+    };
+    Ok(if sign < 0.0 { -axis } else { axis })
+}
+
+/// Where most of `p - R n` meet across the axis: the fullest of cells of a twentieth of the radius, and its mean.
+fn vote_centre(seen: &[(Vec3, Vec3)], frame: &PipeFrame) -> Vec3 {
+    let square = frame.axis.cross(&frame.zero);
+    let cell = frame.radius_mm / 20.0;
+    let place = |p: &Vec3, n: &Vec3| {
+        let v = p - n * frame.radius_mm - frame.origin_mm;
+        (v.dot(&frame.zero), v.dot(&square))
+    };
+    let mut votes: std::collections::BTreeMap<(i64, i64), (usize, f64, f64)> = Default::default();
+    for (p, n) in seen {
+        let (x, y) = place(p, n);
+        let entry = votes.entry(((x / cell).floor() as i64, (y / cell).floor() as i64)).or_default();
+        *entry = (entry.0 + 1, entry.1 + x, entry.2 + y);
+    }
+    let Some((_, &(count, x, y))) = votes.iter().max_by_key(|(key, value)| (value.0, std::cmp::Reverse(**key))) else {
+        return frame.origin_mm;
+    };
+    frame.origin_mm + (frame.zero * x + square * y) / count as f64
+}
+
+/// Moves the axis sideways to the least squares of the radial deviations, reweighted; in place.
+fn refine_centre(seen: &[(Vec3, Vec3)], frame: &mut PipeFrame) {
+    let square = frame.axis.cross(&frame.zero);
+    for _ in 0..10 {
+        let deviation = |p: &Vec3| frame.unroll(&(*p).into());
+        let mut sizes: Vec<f64> = seen.iter().map(|(p, _)| deviation(p)[2].abs()).collect();
+        let scale = 4.685 * 1.4826 * median(&mut sizes).max(1e-6);
+        let (mut xx, mut xy, mut yy, mut bx, mut by) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        for (p, _) in seen {
+            let [angle, _, d] = deviation(p);
+            let w = tukey(d / scale);
+            let (s, c) = angle.sin_cos();
+            xx += w * c * c;
+            xy += w * c * s;
+            yy += w * s * s;
+            bx += w * c * d;
+            by += w * s * d;
+        }
+        let det = xx * yy - xy * xy;
+        if det <= 1e-9 * xx.max(yy).powi(2) {
+            return;
+        }
+        let (dx, dy) = ((yy * bx - xy * by) / det, (xx * by - xy * bx) / det);
+        frame.origin_mm += frame.zero * dx + square * dy;
+        if dx.hypot(dy) < 1e-6 * frame.radius_mm {
+            return;
+        }
+    }
+}
+
+/// Tukey's biweight, zero beyond 1.
+fn tukey(u: f64) -> f64 {
+    if u.abs() < 1.0 { (1.0 - u * u).powi(2) } else { 0.0 }
+}

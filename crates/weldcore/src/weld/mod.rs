@@ -1,0 +1,14 @@
+//! The weld: its walls and cap, the step around the seam, and what became of every pixel.
+
+mod coarse;
+mod label;
+mod pipe_frame;
+pub mod place;
+pub mod seam_fates;
+pub mod sections;
+pub mod segment;
+pub mod step;
+
+pub use coarse::Nominal;
+pub use label::{Fate, Label};
+pub use pipe_frame::{PipeFrame, Unrolled};

@@ -1,0 +1,151 @@
+//! What became of every pixel of a part shot, bin by bin along the seam: none is forgotten.
+//!
+//! A pixel with a point has the fate that [`crate::weld::segment`] gave it. A pixel without one lies where its ray meets the
+//! cylinder of the reference wall, and its fate is the reason that decoding gave.
+
+use super::label::Fate;
+use super::segment::Segmentation;
+use crate::error::{Error, Result};
+use crate::fringes::Reason;
+use crate::ground::threads;
+use crate::ground::transform::Vec3;
+use crate::scanner::Lens;
+
+/// The fates, in the order of `weldscan.result.FATES`: wall, transition, cap, gated, off line, dark, saturated, order in
+/// doubt, two paths, outside the calibration, hidden, other.
+pub const FATES: usize = 12;
+/// Bins of the seam by contract: 2 degrees, centred on even ones.
+pub const BINS: usize = 180;
+/// Pixels this near to the weld count as its own: the surfaces beside the toes are read from them.
+const NEAR_MM: f64 = 8.0;
+
+/// Pixels by bin and fate.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SeamFates {
+    /// All pixels of the view.
+    pub all: Vec<[u32; FATES]>,
+    /// Those on the weld and within 8 mm of its toes.
+    pub near: Vec<[u32; FATES]>,
+}
+
+fn of_fate(fate: u8) -> Option<usize> {
+    match fate {
+        f if f == Fate::Wall as u8 => Some(0),
+        f if f == Fate::Transition as u8 => Some(1),
+        f if f == Fate::Cap as u8 => Some(2),
+        f if f == Fate::Gated as u8 => Some(3),
+        f if f == Fate::OffLine as u8 => Some(4),
+        f if f == Fate::Other as u8 => Some(11),
+        _ => None,
+    }
+}
+
+fn of_reason(reason: u8) -> usize {
+    match reason {
+        r if r == Reason::Saturated as u8 => 6,
+        // Samples that are no sinusoid have no fringe order either.
+        r if r == Reason::OrderInDoubt as u8 || r == Reason::NoFit as u8 => 7,
+        _ => 5,
+    }
+}
+
+/// Counts the pixels of a segmented shot; `reasons` as decoding gave them, `camera` with the shot's width and height.
+///
+/// # Errors
+/// [`Error::Shape`] where the arrays are not those of one image of the camera.
+pub fn seam_fates(shot: &Segmentation, reasons: &[u8], camera: &Lens) -> Result<SeamFates> {
+    let n = camera.width * camera.height;
+    if [shot.fates.len(), reasons.len()] != [n, n] {
+        let got = format!("{} points and {} reasons", shot.fates.len(), reasons.len());
+        return Err(Error::Shape { what: "shot", expected: format!("{n} pixels of the camera"), got });
+    }
+    let frame = &shot.frame;
+    let toes: Vec<(f64, [f64; 2])> =
+        shot.sections.stations.iter().filter_map(|s| Some((s.angle_rad, s.toes_mm?))).collect();
+    let half = toes.iter().map(|t| 0.5 * (t.1[1] - t.1[0])).fold(0.0, f64::max) + NEAR_MM;
+    // How far the view reaches along the axis: beyond it no ray is the seam's.
+    let reach = |i: usize| f64::from(shot.unrolled.axial_mm[i]);
+    let walls = (0..n).step_by(7).filter(|&i| shot.fates[i] == Fate::Wall as u8);
+    let (low, high) = walls.map(reach).fold((f64::INFINITY, f64::NEG_INFINITY), |r, z| (r.0.min(z), r.1.max(z)));
+    let bin = |angle: f64| ((angle.to_degrees() / 2.0).round() as i64).rem_euclid(BINS as i64) as usize;
+    let one = |i: usize| -> Option<(usize, usize, f64)> {
+        if let Some(fate) = of_fate(shot.fates[i]) {
+            return Some((bin(f64::from(shot.unrolled.angle_rad[i])), fate, reach(i)));
+        }
+        let (x, y) = camera.undistort((i % camera.width) as f64, (i / camera.width) as f64)?;
+        let foot = meet(&Vec3::new(x, y, 1.0), &frame.origin_mm, &frame.axis, frame.radius_mm)?;
+        let [angle, axial, _] = frame.unroll(&foot.into());
+        (axial > low && axial < high).then(|| (bin(angle), of_reason(reasons[i]), axial))
+    };
+    let parts = threads::map_ranges(n, |range| {
+        let mut part = (vec![[0_u32; FATES]; BINS], vec![[0_u32; FATES]; BINS]);
+        for (bin, fate, axial) in range.filter_map(one) {
+            part.0[bin][fate] += 1;
+            part.1[bin][fate] += u32::from(axial.abs() < half);
+        }
+        part
+    });
+    let mut found = SeamFates { all: vec![[0; FATES]; BINS], near: vec![[0; FATES]; BINS] };
+    for (all, near) in parts {
+        for k in 0..BINS {
+            for f in 0..FATES {
+                found.all[k][f] += all[k][f];
+                found.near[k][f] += near[k][f];
+            }
+        }
+    }
+    Ok(found)
+}
+
+/// Where a ray from the origin first meets a cylinder.
+fn meet(ray: &Vec3, point: &Vec3, axis: &Vec3, radius: f64) -> Option<Vec3> {
+    let across = |v: &Vec3| v - axis * axis.dot(v);
+    let (d, o) = (across(ray), across(point));
+    let (a, b, c) = (d.norm_squared(), d.dot(&o), o.norm_squared() - radius * radius);
+    let root = b * b - a * c;
+    (a > 0.0 && root >= 0.0).then(|| (b - root.sqrt()) / a).filter(|t| *t > 0.0).map(|t| ray * t)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::weld::segment::segment;
+    use crate::weld::segment::tests::{COLUMNS, EXAMPLE, ROWS};
+
+    #[test]
+    fn every_pixel_of_the_seam_is_counted_once() {
+        let mut points = EXAMPLE.points();
+        let mut reasons = vec![0_u8; points.len()];
+        // A band across the whole view is dark, another saturated.
+        for row in 100..120 {
+            for column in 0..COLUMNS {
+                let i = row * COLUMNS + column;
+                points[i] = [f64::NAN; 3];
+                reasons[i] = if row < 110 { Reason::Dark as u8 } else { Reason::Saturated as u8 };
+            }
+        }
+        let shot = segment(&points, COLUMNS, &EXAMPLE.nominal()).unwrap();
+        // A camera that sees the pipe as the points do: about 0.5 mm a pixel at 420 mm.
+        let camera = Lens::new(COLUMNS, ROWS, [880.0, 880.0], [189.0, 149.5], [0.0; 5]).unwrap();
+        let found = seam_fates(&shot, &reasons, &camera).unwrap();
+        let total = |f: usize| found.all.iter().map(|b| b[f]).sum::<u32>();
+        let valid = points.iter().filter(|p| p[0].is_finite()).count() as u32;
+        assert_eq!([0, 1, 2, 3, 4, 11].map(total).iter().sum::<u32>(), valid);
+        // The rays of nearly all lost pixels meet the pipe.
+        for (fate, lost) in [(5, 10 * COLUMNS), (6, 10 * COLUMNS)] {
+            assert!(f64::from(total(fate)) > 0.9 * lost as f64, "{fate} {} {lost}", total(fate));
+        }
+        assert!(total(0) > 8 * valid / 10 && total(2) > 0 && total(3) == 0);
+        for k in 0..BINS {
+            assert!(std::iter::zip(found.near[k], found.all[k]).all(|(near, all)| near <= all));
+        }
+        assert!(seam_fates(&shot, &reasons[1..], &camera).is_err());
+    }
+
+    #[test]
+    fn a_ray_meets_the_near_side_of_a_cylinder() {
+        let hit = meet(&Vec3::z(), &Vec3::new(3.0, 0.0, 100.0), &Vec3::y(), 5.0).unwrap();
+        assert!((hit - Vec3::new(0.0, 0.0, 96.0)).norm() < 1e-12);
+        assert!(meet(&Vec3::z(), &Vec3::new(6.0, 0.0, 100.0), &Vec3::y(), 5.0).is_none());
+    }
+}

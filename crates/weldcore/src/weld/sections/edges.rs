@@ -1,0 +1,103 @@
+//! The surface right beside a toe, as a gauge reads it: the value at the toe of the longest stretch that still tells the
+//! same as all shorter ones (Lepski, Theory Probab. Appl. 35 (1991) 454). Right-hand toes: the inside lies at smaller x.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::profile::Profile;
+use crate::ground::robust::median;
+
+/// The first strip beside a toe is rounded by the toe itself and by the size of a pixel. On it, and as far again as a part
+/// of the cap's height, the cap's flank throws light that pulls the phase by some hundredths of a millimetre.
+const CLEAR_MM: f64 = 0.35;
+const CLEAR_HEIGHTS: f64 = 0.4;
+const CLEAR_MOST_MM: f64 = 1.35;
+/// Stretches that are tried, mm: straight ones and curved ones.
+const STRAIGHT_MM: [f64; 5] = [2.0, 3.0, 5.0, 8.0, 12.0];
+const CURVED_MM: [f64; 4] = [3.5, 6.0, 10.0, 16.0];
+/// The first strip beside a toe is held against what was read further out; light of the flank moves it by this much.
+const STRIP_MM: f64 = 1.0;
+const FLANK_LIGHT_MM: f64 = 0.06;
+/// A stretch counts where its far end is seen at least up to this part.
+const SEEN_PART: f64 = 0.7;
+/// The slope beside a toe is that of a line of this length: a shorter one shows the noise.
+const SLOPE_MM: f64 = 3.5;
+/// What the choice of the stretch costs, as a part of the spread of those that are as good.
+const CHOICE: f64 = 0.35;
+/// Below this nothing is known better: the projector's response and the camera's pixels.
+const FLOOR_MM: f64 = 0.006;
+/// Huber's bend, in scales of the residual, and rounds of reweighting.
+const HUBER: f64 = 2.0;
+const ROUNDS: usize = 3;
+
+/// What a gauge would read beside a toe.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Reading {
+    /// Height of the surface at the toe.
+    pub height: f64,
+    /// Its standard uncertainty: noise, and the choice of the stretch.
+    pub u: f64,
+    /// Slope of the surface beside the toe.
+    pub slope: f64,
+    /// How far the first millimetre beside the toe is off what was read: a bare strip before a tape, or a flare.
+    pub strip: f64,
+}
+
+/// Reads the surface to the right of `toe`, beside a cap of this height; `None` where too little of it is there.
+pub(super) fn read(profile: &Profile, toe: f64, cap_height: f64, sigma: f64) -> Option<Reading> {
+    let clear = (CLEAR_MM + CLEAR_HEIGHTS * cap_height.abs()).min(CLEAR_MOST_MM);
+    let mut found: Vec<(f64, StretchFit)> = Vec::new();
+    let kinds = STRAIGHT_MM.iter().map(|&l| (l, 1)).chain(CURVED_MM.iter().map(|&l| (l, 2)));
+    for (length, degree) in kinds {
+        if let Some(fit) = stretch(profile, toe, [clear, length], degree, sigma) {
+            found.push((length, fit));
+        }
+    }
+    // From the noisiest to the least noisy: the last that agrees with all before it.
+    found.sort_by(|a, b| b.1.variance.total_cmp(&a.1.variance).then(a.0.total_cmp(&b.0)));
+    let agrees =
+        |i: usize| found[..i].iter().all(|(_, f)| (f.value - found[i].1.value).abs() <= 2.0 * f.variance.sqrt());
+    let chosen = (0..found.len()).rev().find(|&i| agrees(i))?;
+    let best = &found[chosen].1;
+    let as_good = found[..=chosen].iter().filter(|(_, f)| f.variance <= 4.0 * best.variance).map(|(_, f)| f.value);
+    let (low, high) = as_good.fold((f64::INFINITY, f64::NEG_INFINITY), |r, v| (r.0.min(v), r.1.max(v)));
+    let u = (best.variance + (CHOICE * (high - low)).powi(2) + FLOOR_MM * FLOOR_MM).sqrt();
+    let slope = stretch(profile, toe, [clear, SLOPE_MM], 1, sigma).map_or(best.slope, |f| f.slope);
+    let (from, to) = (profile.boundary(toe + CLEAR_MM), profile.boundary(toe + CLEAR_MM + STRIP_MM));
+    let strip = profile.mean(from, to).map_or(0.0, |(x, h)| (h - best.value - best.slope * (x - toe)).abs());
+    let seen = FLANK_LIGHT_MM + 3.0 * sigma / profile.count(from, to).max(1.0).sqrt();
+    Some(Reading { height: best.value, u, slope, strip: if strip > seen { strip } else { 0.0 } })
+}
+
+struct StretchFit {
+    value: f64,
+    slope: f64,
+    variance: f64,
+}
+
+fn stretch(profile: &Profile, toe: f64, [clear, length]: [f64; 2], degree: usize, sigma: f64) -> Option<StretchFit> {
+    let from = profile.boundary(toe + clear);
+    let to = profile.boundary(toe + clear + length);
+    let points: Vec<(f64, f64)> = (from..to)
+        .filter(|&i| profile.heights[i].is_finite())
+        .map(|i| ((profile.x(i) - toe) / length, profile.heights[i]))
+        .collect();
+    if points.len() < degree + 2 || points.last()?.0 < SEEN_PART {
+        return None;
+    }
+    let rows = DMatrix::from_fn(points.len(), degree + 1, |r, c| points[r].0.powi(c as i32));
+    let heights = DVector::from_iterator(points.len(), points.iter().map(|p| p.1));
+    let mut weights = DVector::from_element(points.len(), 1.0);
+    let mut fit = None;
+    for _ in 0..ROUNDS {
+        let weighted = DMatrix::from_fn(points.len(), degree + 1, |r, c| weights[r] * rows[(r, c)]);
+        let normal = rows.transpose() * &weighted;
+        let inverse = normal.cholesky()?.inverse();
+        let c = &inverse * (weighted.transpose() * &heights);
+        let residuals = &heights - &rows * &c;
+        let mut sizes: Vec<f64> = residuals.iter().map(|r| r.abs()).collect();
+        let scale = (1.4826 * median(&mut sizes)).max(sigma).max(1e-9);
+        residuals.iter().zip(weights.iter_mut()).for_each(|(r, w)| *w = (HUBER * scale / r.abs().max(1e-12)).min(1.0));
+        fit = Some(StretchFit { value: c[0], slope: c[1] / length, variance: scale * scale * inverse[(0, 0)] });
+    }
+    fit
+}

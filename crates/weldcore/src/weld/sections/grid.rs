@@ -1,0 +1,239 @@
+//! The unrolled view as cells: stations along the seam by bins across it, each with the median of its points.
+
+use rayon::prelude::*;
+
+use crate::error::{Error, Result, require_count};
+use crate::ground::robust::median;
+use crate::ground::threads;
+use crate::weld::pipe_frame::{PipeFrame, Unrolled};
+
+/// Length of a station along the seam: short enough that a dent of two degrees on a large pipe fills one, long enough
+/// for several points a bin.
+const STATION_MM: f64 = 4.0;
+/// The same on a pipe of less than 50 mm radius, whose arcs are short.
+const SMALL_STATION_MM: f64 = 2.5;
+const SMALL_RADIUS_MM: f64 = 50.0;
+/// Bins across the seam, in point spacings, and their least and largest width: a toe is placed to about a bin.
+const BIN_SPACINGS: f64 = 0.8;
+const BIN_MM: [f64; 2] = [0.2, 0.8];
+/// A coarse cloud gets wider bins, so that a cell holds so many points.
+const POINTS_PER_CELL: f64 = 3.0;
+/// A median of fewer points is a point.
+const LEAST_POINTS: usize = 2;
+/// Cells with so many points tell the noise.
+const NOISE_POINTS: usize = 6;
+/// Of every so many points one tells how far the view reaches.
+const RANGE_STRIDE: usize = 16;
+
+/// Where a point lies in the grid.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Place {
+    /// Along the seam from the middle of the view, mm.
+    pub along: f64,
+    /// Across the seam, mm.
+    pub across: f64,
+    /// Height over the frame's cylinder, mm.
+    pub height: f64,
+}
+
+/// Stations by bins with medians.
+#[derive(Debug, Clone)]
+pub(crate) struct Grid {
+    /// Angle of the middle of the view.
+    pub middle_rad: f64,
+    pub radius_mm: f64,
+    pub start_along: f64,
+    pub station_mm: f64,
+    pub stations: usize,
+    pub start_across: f64,
+    pub bin_mm: f64,
+    pub bins: usize,
+    /// Median height per cell, station by station; NaN with fewer than two points.
+    pub heights: Vec<f64>,
+    /// Noise of one point across the wall, one sigma.
+    pub noise_mm: f64,
+    /// Noise of a cell's median.
+    pub cell_sigma_mm: f64,
+}
+
+impl Grid {
+    /// Cells of all points at the angles where the pipe is; `near_mm` tells which points are the pipe's when the extent of
+    /// the view is sought (a cell takes points of any height: a deep dent is one of the part's places too).
+    pub fn of(unrolled: &Unrolled, frame: &PipeFrame, near_mm: f64) -> Result<Self> {
+        let near = |i: usize| f64::from(unrolled.deviation_mm[i].abs()) < near_mm;
+        let n = unrolled.deviation_mm.len();
+        let count = unrolled.deviation_mm.iter().filter(|d| f64::from(d.abs()) < near_mm).count();
+        require_count("part points near the nominal pipe", 1000, count)?;
+        let (mut c, mut s) = (0.0, 0.0);
+        for i in (0..n).step_by(RANGE_STRIDE).filter(|&i| near(i)) {
+            let (sin, cos) = unrolled.angle_rad[i].sin_cos();
+            (c, s) = (c + f64::from(cos), s + f64::from(sin));
+        }
+        let mut grid = Self {
+            middle_rad: s.atan2(c),
+            radius_mm: frame.radius_mm,
+            start_along: 0.0,
+            station_mm: 1.0,
+            stations: 1,
+            start_across: 0.0,
+            bin_mm: 1.0,
+            bins: 1,
+            heights: Vec::new(),
+            noise_mm: 0.0,
+            cell_sigma_mm: 0.0,
+        };
+        let places = (0..n).step_by(RANGE_STRIDE).filter(|&i| near(i)).map(|i| grid.place(unrolled, i));
+        let (along, across): (Vec<f64>, Vec<f64>) = places.map(|p| (p.along, p.across)).unzip();
+        let (along, across) = (inner_range(along), inner_range(across));
+        let spacing = ((along.1 - along.0) * (across.1 - across.0) / count as f64).sqrt();
+        if !(spacing.is_finite() && spacing > 0.0) {
+            return Err(Error::Degenerate { what: "part", reason: "its points span no surface".into() });
+        }
+        let wanted = if frame.radius_mm < SMALL_RADIUS_MM { SMALL_STATION_MM } else { STATION_MM };
+        grid.stations = (((along.1 - along.0) / wanted).round() as usize).clamp(1, 4096);
+        grid.station_mm = (along.1 - along.0) / grid.stations as f64;
+        grid.start_along = along.0;
+        let filled = POINTS_PER_CELL * spacing * spacing / grid.station_mm;
+        let bin = (BIN_SPACINGS * spacing).clamp(BIN_MM[0], BIN_MM[1]).max(filled);
+        grid.bins = (((across.1 - across.0) / bin).round() as usize).clamp(16, 8192);
+        grid.bin_mm = (across.1 - across.0) / grid.bins as f64;
+        grid.start_across = across.0;
+        grid.take_medians(unrolled);
+        Ok(grid)
+    }
+
+    #[inline]
+    pub fn place(&self, unrolled: &Unrolled, i: usize) -> Place {
+        let turn = f64::from(unrolled.angle_rad[i]) - self.middle_rad;
+        let turn = turn - (turn / std::f64::consts::TAU).round() * std::f64::consts::TAU;
+        Place {
+            along: turn * self.radius_mm,
+            across: f64::from(unrolled.axial_mm[i]),
+            height: f64::from(unrolled.deviation_mm[i]),
+        }
+    }
+
+    /// The station of a place along the seam; the outermost points belong to the outermost stations.
+    #[inline]
+    pub fn station(&self, along: f64) -> Option<usize> {
+        self.station_within(along, 0.5)
+    }
+
+    /// The same up to so many stations beyond the outermost ones: the corners of a view.
+    #[inline]
+    pub fn station_within(&self, along: f64, beyond: f64) -> Option<usize> {
+        let k = (along - self.start_along) / self.station_mm;
+        (k > -beyond && k < self.stations as f64 + beyond).then(|| (k.max(0.0) as usize).min(self.stations - 1))
+    }
+
+    #[inline]
+    fn bin(&self, across: f64) -> Option<usize> {
+        let k = (across - self.start_across) / self.bin_mm;
+        (k >= 0.0 && k < self.bins as f64).then_some(k as usize)
+    }
+
+    /// Middle of a station, as an angle of the frame.
+    pub fn angle_rad(&self, station: usize) -> f64 {
+        self.middle_rad + (self.start_along + (station as f64 + 0.5) * self.station_mm) / self.radius_mm
+    }
+
+    /// Heights of one station.
+    pub fn row(&self, station: usize) -> &[f64] {
+        &self.heights[station * self.bins..(station + 1) * self.bins]
+    }
+
+    /// The median of each station and its neighbours: what is sought in it is longer than a station.
+    pub fn smoothed(&self) -> Vec<f64> {
+        let one = |k: usize| -> Vec<f64> {
+            let rows: Vec<&[f64]> =
+                (k.saturating_sub(1)..(k + 2).min(self.stations)).map(|other| self.row(other)).collect();
+            (0..self.bins)
+                .map(|j| {
+                    let mut values: Vec<f64> = rows.iter().map(|r| r[j]).filter(|h| h.is_finite()).collect();
+                    if values.is_empty() { f64::NAN } else { median(&mut values) }
+                })
+                .collect()
+        };
+        threads::install(|| (0..self.stations).into_par_iter().flat_map_iter(one).collect())
+    }
+
+    fn take_medians(&mut self, unrolled: &Unrolled) {
+        let cells = self.stations * self.bins;
+        let cell_of = |i: usize| {
+            let p = self.place(unrolled, i);
+            p.height.is_finite().then_some(())?;
+            Some((self.station(p.along)? * self.bins + self.bin(p.across)?, p.height as f32))
+        };
+        let mut starts = vec![0_usize; cells + 1];
+        let found: Vec<Vec<(u32, f32)>> = threads::map_ranges(unrolled.angle_rad.len(), |range| {
+            range.filter_map(|i| cell_of(i).map(|(k, d)| (k as u32, d))).collect()
+        });
+        for (cell, _) in found.iter().flatten() {
+            starts[*cell as usize + 1] += 1;
+        }
+        for k in 0..cells {
+            starts[k + 1] += starts[k];
+        }
+        let mut sorted = vec![0.0_f32; starts[cells]];
+        let mut next = starts.clone();
+        for (cell, d) in found.iter().flatten() {
+            sorted[next[*cell as usize]] = *d;
+            next[*cell as usize] += 1;
+        }
+        let mut slices: Vec<&mut [f32]> = Vec::with_capacity(cells);
+        let mut rest = sorted.as_mut_slice();
+        for k in 0..cells {
+            let (head, tail) = rest.split_at_mut(starts[k + 1] - starts[k]);
+            slices.push(head);
+            rest = tail;
+        }
+        let stats: Vec<(f64, f64, usize)> = threads::install(|| slices.into_par_iter().map(cell_statistics).collect());
+        let mut noises: Vec<f64> = stats.iter().map(|s| s.1).filter(|s| s.is_finite()).collect();
+        let mut counts: Vec<f64> = stats.iter().filter(|s| s.0.is_finite()).map(|s| s.2 as f64).collect();
+        self.heights = stats.iter().map(|s| s.0).collect();
+        self.noise_mm = if noises.len() >= 20 { median(&mut noises) } else { self.noise_between_cells() };
+        // The median of n normal values scatters by 1.25 / sqrt(n) sigma.
+        self.cell_sigma_mm = 1.25 * self.noise_mm / median(&mut counts).max(1.0).sqrt();
+    }
+
+    /// Where cells hold too few points: second differences of neighbouring medians, which a smooth surface leaves at zero.
+    fn noise_between_cells(&self) -> f64 {
+        let mut bends: Vec<f64> = (0..self.stations)
+            .flat_map(|k| self.row(k).windows(3).map(|w| (w[0] - 2.0 * w[1] + w[2]).abs()))
+            .filter(|b| b.is_finite())
+            .collect();
+        if bends.is_empty() { 0.0 } else { 1.4826 * median(&mut bends) / 6f64.sqrt() }
+    }
+}
+
+/// Median, noise of one point (NaN with too few), and count.
+fn cell_statistics(values: &mut [f32]) -> (f64, f64, usize) {
+    let n = values.len();
+    if n < LEAST_POINTS {
+        return (f64::NAN, f64::NAN, n);
+    }
+    let middle = |values: &mut [f32]| {
+        let high = *values.select_nth_unstable_by(n / 2, f32::total_cmp).1;
+        if n % 2 == 1 {
+            return f64::from(high);
+        }
+        let low = values[..n / 2].iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        0.5 * (f64::from(low) + f64::from(high))
+    };
+    let m = middle(values);
+    if n < NOISE_POINTS {
+        return (m, f64::NAN, n);
+    }
+    values.iter_mut().for_each(|v| *v = (*v - m as f32).abs());
+    // Of few values the MAD is too small by about this factor (Croux and Rousseeuw, COMPSTAT 1992, 411).
+    (m, 1.4826 * middle(values) * n as f64 / (n as f64 - 0.8), n)
+}
+
+/// The range of values without its outermost thousandth on either side: stray points do not stretch the view.
+fn inner_range(mut values: Vec<f64>) -> (f64, f64) {
+    let cut = values.len() / 1000;
+    let last = values.len() - 1 - cut;
+    let low = *values.select_nth_unstable_by(cut, f64::total_cmp).1;
+    let high = *values.select_nth_unstable_by(last, f64::total_cmp).1;
+    (low, high)
+}

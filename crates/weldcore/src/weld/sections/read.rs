@@ -1,0 +1,279 @@
+//! The stations read: toes, walls, transition, edges, cap.
+
+use rayon::prelude::*;
+
+use super::cap::Candidate;
+use super::profile::Profile;
+use super::station::{Edge, Kind, Station, running_median};
+use super::toes::Toe;
+use super::view::{FLUSH_GAP_MM, Found, View};
+use super::{doubts, edges, toes, walls};
+use crate::ground::robust::median;
+use crate::ground::threads;
+
+/// A station is seen where this part of the usual bins near the weld holds points.
+const SEEN_PART: f64 = 0.3;
+/// Near the weld: so far beyond its toes.
+const NEAR_MM: f64 = 8.0;
+/// Gaps between the readings of a flush weld, in widest caps: nobody knows where its toes are.
+const FLUSH_GAPS: [f64; 2] = [0.2, 0.4];
+/// Toes wander by less than this between neighbours, and as a part of the width.
+const WANDER_MM: f64 = 0.6;
+const WANDER_WIDTHS: f64 = 0.06;
+
+impl View<'_> {
+    /// A toe of a station: side 0 is the reference wall's.
+    fn toe(&self, station: usize, candidate: &Candidate, side: usize, band: Option<[f64; 2]>) -> Option<Toe> {
+        let profile = &self.smooth[station][side];
+        if side == 1 {
+            return toes::toe(profile, candidate.from, candidate.to, self.sigma, band);
+        }
+        let n = profile.len();
+        let band = band.map(|[low, high]| [-high, -low]);
+        let toe = toes::toe(profile, n - candidate.to, n - candidate.from, self.sigma, band)?;
+        Some(Toe { at: -toe.at, from: -toe.to, to: -toe.from })
+    }
+
+    pub(super) fn stations(&self, found: &Found) -> Vec<Station> {
+        let count = self.grid.stations;
+        let chosen = &found.course.chosen;
+        let mut toes: Vec<[Option<Toe>; 2]> = threads::install(|| {
+            (0..count)
+                .into_par_iter()
+                .map(|k| {
+                    std::array::from_fn(|side| {
+                        let c = chosen[k].as_ref()?;
+                        if found.kind == Kind::Flush {
+                            let at = c.toes[side];
+                            return Some(Toe { at, from: at, to: at });
+                        }
+                        self.toe(k, c, side, None)
+                    })
+                })
+                .collect()
+        });
+        if found.kind != Kind::Flush {
+            self.second_look(found, &mut toes);
+        }
+        // The middle and the usual width, for stations that have none of their own.
+        let usual: [f64; 2] = std::array::from_fn(|side| {
+            let mut off: Vec<f64> =
+                (0..count).filter_map(|k| Some(toes[k][side]?.at - found.course.at(self.along(k)))).collect();
+            if off.is_empty() { 0.0 } else { median(&mut off) }
+        });
+        let mut stations: Vec<Station> =
+            threads::install(|| (0..count).into_par_iter().map(|k| self.station(k, found, toes[k], usual)).collect());
+        // A ripple of the cap has a foot and a groove too; an end that flares has it in all neighbours.
+        let feet: Vec<Option<f64>> = stations.iter().map(|s| s.edge.map(|e| e.foot_mm)).collect();
+        for (k, station) in stations.iter_mut().enumerate() {
+            if let Some(edge) = &mut station.edge {
+                let mut near: Vec<f64> =
+                    feet[k.saturating_sub(2)..(k + 3).min(feet.len())].iter().flatten().copied().collect();
+                edge.foot_mm = if near.len() == 2 { near[0].min(near[1]) } else { median(&mut near) };
+                edge.hull_mm += edge.foot_mm;
+            }
+        }
+        stations
+    }
+
+    /// Toes off the running median of their neighbours are sought again near it.
+    fn second_look(&self, found: &Found, toes: &mut [[Option<Toe>; 2]]) {
+        let width = found.course.width();
+        let band = WANDER_MM.max(WANDER_WIDTHS * width);
+        for side in 0..2 {
+            let at: Vec<Option<f64>> = toes.iter().map(|t| t[side].map(|t| t.at)).collect();
+            for k in 0..toes.len() {
+                let (Some(own), Some(c)) = (at[k], found.course.chosen[k].as_ref()) else { continue };
+                let Some(usual) = running_median(&at, k, 4) else { continue };
+                if (own - usual).abs() > band
+                    && let Some(again) = self.toe(k, c, side, Some([usual - band, usual + band]))
+                {
+                    // What the free search found stays plausible.
+                    let first = toes[k][side].map_or([own, own], |t| [t.from, t.to]);
+                    let kept = (first[0] - usual).abs().max((first[1] - usual).abs()) <= 2.0 * band;
+                    let (from, to) =
+                        if kept { (again.from.min(first[0]), again.to.max(first[1])) } else { (again.from, again.to) };
+                    toes[k][side] = Some(Toe { at: again.at, from, to });
+                }
+            }
+        }
+    }
+
+    fn station(&self, k: usize, found: &Found, toes: [Option<Toe>; 2], usual: [f64; 2]) -> Station {
+        let middle = found.course.at(self.along(k));
+        let by_course = toes.iter().any(Option::is_none);
+        let toes: [Toe; 2] = std::array::from_fn(|side| {
+            let at = middle + usual[side];
+            toes[side].unwrap_or(Toe { at, from: at - WANDER_MM, to: at + WANDER_MM })
+        });
+        let own = &self.own[k];
+        let seen = {
+            let near = |side: usize| {
+                let at = if side == 0 { -toes[0].at } else { toes[1].at };
+                let (from, to) = (own[side].boundary(at), own[side].boundary(at + NEAR_MM));
+                (to - from).min(own[side].in_bins(NEAR_MM)) > 0
+                    && own[side].count(from, to) >= SEEN_PART * own[side].in_bins(NEAR_MM) as f64
+            };
+            near(0) && near(1)
+        };
+        let mut station = Station {
+            angle_rad: self.grid.angle_rad(k),
+            seen,
+            kind: found.kind,
+            by_course,
+            toes_mm: None,
+            height_mm: 0.0,
+            edge: None,
+            undisturbed_mm: [None; 2],
+            departure_mm: [0.0; 2],
+            wall_step_mm: None,
+            walls: [None; 2],
+        };
+        if !seen {
+            return station;
+        }
+        let shell = [self.grid.radius_mm, self.thickness_mm];
+        let centre = 0.5 * (toes[0].at + toes[1].at);
+        station.toes_mm = Some([toes[0].at, toes[1].at]);
+        for (side, toe) in toes.iter().enumerate() {
+            let sign = if side == 0 { -1.0 } else { 1.0 };
+            let profile = &self.smooth[k][side];
+            station.walls[side] = walls::grow(profile, sign * toe.at, sign * centre, shell, self.sigma);
+            station.undisturbed_mm[side] = station.walls[side].map(|run| sign * run.from);
+        }
+        if let (Some(a), Some(b)) = (station.straight_at(0, centre), station.straight_at(1, centre)) {
+            station.wall_step_mm = Some(b - a);
+        }
+        for side in 0..2 {
+            station.departure_mm[side] = self.departure(k, &station, &toes, side);
+        }
+        let (edge, height) = self.edge(k, found, &station, &toes);
+        station.edge = edge;
+        station.height_mm = height;
+        station
+    }
+
+    /// Largest departure of the transition from the straight wall, over blocks of bins. What may as well be the cap's
+    /// flank is no transition: the edges' hull bears it.
+    fn departure(&self, k: usize, station: &Station, toes: &[Toe; 2], side: usize) -> f64 {
+        let Some(run) = station.walls[side] else { return 0.0 };
+        let profile = &self.smooth[k][side];
+        let [at, last] = if side == 0 { [-toes[0].at, -toes[0].from] } else { [toes[1].at, toes[1].to] };
+        let (from, to) = (profile.boundary(last.max(at + 1.0)), profile.boundary(run.from));
+        let block = profile.in_bins(1.0);
+        (from..to)
+            .step_by(block)
+            .filter_map(|at| profile.mean(at, (at + block).min(to)))
+            .map(|(x, h)| (h - run.straight(x)).abs())
+            .fold(0.0, f64::max)
+    }
+
+    /// The edge step of a station, and the height of its cap.
+    fn edge(&self, k: usize, found: &Found, station: &Station, toes: &[Toe; 2]) -> (Option<Edge>, f64) {
+        let slopes = [station.slope(0), station.slope(1)];
+        // Along the bisector of both walls; where one is unknown, along the other.
+        let (slope, slope_u) = match slopes {
+            [Some(a), Some(b)] => {
+                let u = station.walls.iter().flatten().map(|r| r.slope_u).fold(0.0, f64::hypot) / 2.0;
+                (0.5 * (a + b), u)
+            }
+            [Some(a), None] | [None, Some(a)] => {
+                (a, station.walls.iter().flatten().map(|r| r.slope_u).fold(0.0, f64::max))
+            }
+            [None, None] => return (None, 0.0),
+        };
+        let height = if found.kind == Kind::Flush { 0.0 } else { self.cap_height(k, [toes[0].at, toes[1].at]) };
+        let read = |places: [f64; 2]| -> Option<Edge> {
+            let a = edges::read(&self.own[k][0], -places[0], height, self.sigma)?;
+            let b = edges::read(&self.own[k][1], places[1], height, self.sigma)?;
+            let width = places[1] - places[0];
+            let leaning = [(-a.slope - slope).abs(), (b.slope - slope).abs()];
+            let doubt = |side: usize| (toes[side].to - toes[side].at).max(toes[side].at - toes[side].from);
+            let (hull, foot) = if found.kind == Kind::Flush {
+                (0.0, 0.0)
+            } else {
+                let foot = self.foot(k, found, toes, [a.height, b.height])
+                    + self.groove(k, found, station)
+                    + a.strip
+                    + b.strip;
+                (leaning[0] * doubt(0) + leaning[1] * doubt(1), foot)
+            };
+            Some(Edge {
+                step_mm: b.height - a.height - slope * width,
+                standard_mm: (a.u * a.u + b.u * b.u + (slope_u * width).powi(2)).sqrt(),
+                hull_mm: hull,
+                foot_mm: foot,
+            })
+        };
+        let middle = 0.5 * (toes[0].at + toes[1].at);
+        if found.kind == Kind::Flush {
+            // Nobody knows where the toes of a ground weld were: the reading that is furthest from zero counts.
+            let gaps = std::iter::once(0.5 * FLUSH_GAP_MM)
+                .chain(FLUSH_GAPS.iter().map(|g| 0.5 * FLUSH_GAP_MM + g * self.widest_mm));
+            let all: Vec<Edge> = gaps.filter_map(|half| read([middle - half, middle + half])).collect();
+            let most = all
+                .iter()
+                .max_by(|a, b| (a.step_mm.abs() + a.expanded_mm()).total_cmp(&(b.step_mm.abs() + b.expanded_mm())));
+            return (most.copied(), 0.0);
+        }
+        (read([toes[0].at, toes[1].at]), height)
+    }
+
+    /// Height of a cap over the chord between its toes; negative for a hollow one.
+    fn cap_height(&self, k: usize, toes: [f64; 2]) -> f64 {
+        let profile = &self.smooth[k][1];
+        let (from, to) = (profile.boundary(toes[0]), profile.boundary(toes[1]));
+        let over = doubts::over_chord(profile, from, to).unwrap_or_default();
+        over.into_iter().fold(0.0, |most: f64, h| if h.abs() > most.abs() { h } else { most })
+    }
+
+    /// Where a flank flattens outward, metal that looks like the foot of the cap may be the wall's own edge (an end that
+    /// flares within a few millimetres has no kink at its toe): its height over the surface beside the toe, both sides.
+    fn foot(&self, k: usize, found: &Found, toes: &[Toe; 2], beside: [f64; 2]) -> f64 {
+        let sign = if found.kind == Kind::Hollow { -1.0 } else { 1.0 };
+        (0..2)
+            .map(|side| {
+                let profile = &self.smooth[k][side];
+                let toe = if side == 0 { -toes[0].at } else { toes[1].at };
+                let far = if side == 0 { -toes[1].at } else { toes[0].at };
+                foot(profile, toe, far, beside[side], sign, self.sigma)
+            })
+            .sum()
+    }
+}
+
+/// The flank's slope is that of windows of a millimetre.
+const FLANK_WINDOW_MM: f64 = 1.0;
+const ROUNDED_MM: f64 = 0.35;
+/// A cap is steepest at its toe, but for its ripples. Where the last millimetre has less than this part of the steepest
+/// slope, it may be something else than the cap.
+const FOOT_SLOPE: f64 = 0.5;
+/// A flank that hides behind its cap shows no foot: at least this part of it must be seen.
+const FLANK_PART: f64 = 0.7;
+
+fn foot(profile: &Profile, toe: f64, far: f64, beside: f64, sign: f64, sigma: f64) -> f64 {
+    // The last strip is rounded by the toe itself and by the size of a pixel.
+    let (from, to) = (profile.boundary(0.5 * (toe + far)), profile.boundary(toe - ROUNDED_MM));
+    let window = profile.in_bins(FLANK_WINDOW_MM).max(3);
+    if to < from + 2 * window {
+        return 0.0;
+    }
+    let steep: Vec<(f64, f64, f64)> = (from..=to - window)
+        .filter_map(|i| {
+            profile
+                .line(i, i + window)
+                .map(|l| (0.5 * (profile.edge(i) + profile.edge(i + window)), -sign * l.slope, sigma / l.sxx.sqrt()))
+        })
+        .collect();
+    let Some(&(_, last, se)) = steep.last() else { return 0.0 };
+    let most = steep.iter().map(|s| s.1).fold(0.0, f64::max);
+    let Some(&(x, _, _)) = steep.iter().rev().find(|s| s.1 >= 0.9 * most) else { return 0.0 };
+    if last >= FOOT_SLOPE * most - 2.0 * se || toe - ROUNDED_MM - x <= FLANK_WINDOW_MM {
+        return 0.0;
+    }
+    let at = profile.boundary(x);
+    if profile.count(at, to) < FLANK_PART * (to - at) as f64 {
+        return 0.0;
+    }
+    profile.mean(at.saturating_sub(1), (at + 1).min(profile.len())).map_or(0.0, |(_, h)| (h - beside).abs())
+}

@@ -1,0 +1,102 @@
+//! Where a cap ends: the place that two free parabolas, one on its flank and one on what lies beside it, meet at best.
+//!
+//! Everything here looks at a right-hand toe: the inside lies at smaller x.
+
+use super::profile::Profile;
+
+/// The flank is looked at from where the cap has come down to this part of its height: crowns are flat or ridged.
+const FLANK_FROM: f64 = 0.65;
+/// And at least so many bins of it.
+const FLANK_BINS: usize = 6;
+/// How far beyond the detected toe the surface beside it is looked at, and the same in widths.
+const BEYOND_MM: f64 = 5.0;
+const BEYOND_WIDTHS: f64 = 0.25;
+/// Bins further than this from both parabolas are spatter or holes' edges (MADs; once).
+const CLIP_MADS: f64 = 3.0;
+/// Toes whose sum of squares is this much larger (in units of the residual's variance) are as plausible: three sigma.
+const PLAUSIBLE: f64 = 10.0;
+
+/// A toe with the range in which it may as well be.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Toe {
+    pub at: f64,
+    pub from: f64,
+    pub to: f64,
+}
+
+/// The toe of a cap whose candidate ends at the bin boundary `end` and begins at `begin`; `band` narrows the search.
+pub(super) fn toe(profile: &Profile, begin: usize, end: usize, sigma: f64, band: Option<[f64; 2]>) -> Option<Toe> {
+    let width = profile.edge(end) - profile.edge(begin);
+    let from = flank(profile, begin, end)?;
+    let to = profile.boundary(profile.edge(end) + (BEYOND_WIDTHS * width).max(BEYOND_MM));
+    if to < from + 8 {
+        return None;
+    }
+    let (best, _) = search(profile, from, to, sigma, band)?;
+    let kept = {
+        let (inside, beside) = (profile.parabola(from, best)?, profile.parabola(best, to)?);
+        let off = |i: usize| {
+            let model = if i < best { inside.at(profile.x(i)) } else { beside.at(profile.x(i)) };
+            (profile.heights[i] - model).abs()
+        };
+        let mut sizes: Vec<f64> = (from..to).map(off).filter(|d| d.is_finite()).collect();
+        let limit = CLIP_MADS * (1.4826 * crate::ground::robust::median(&mut sizes)).max(sigma);
+        profile.keeping(|i| i < from || i >= to || off(i) <= limit)
+    };
+    let (best, range) = search(&kept, from, to, sigma, band)?;
+    let mut at = kept.edge(best);
+    // The parabolas' own crossing, where it is next to the boundary of two bins.
+    if let (Some(inside), Some(beside)) = (kept.parabola(from, best), kept.parabola(best, to)) {
+        let gap = |x: f64| inside.at(x) - beside.at(x);
+        let (low, high) = (at - 1.5 * kept.bin, at + 1.5 * kept.bin);
+        if gap(low) * gap(high) < 0.0 {
+            let (mut low, mut high) = (low, high);
+            for _ in 0..40 {
+                let middle = 0.5 * (low + high);
+                if gap(low) * gap(middle) <= 0.0 {
+                    high = middle;
+                } else {
+                    low = middle;
+                }
+            }
+            at = 0.5 * (low + high);
+        }
+    }
+    Some(Toe { at, from: range[0].min(at), to: range[1].max(at) })
+}
+
+/// The bin from which the flank is looked at.
+fn flank(profile: &Profile, begin: usize, end: usize) -> Option<usize> {
+    let beside = profile.in_bins(4.0);
+    let left = profile.line(begin.saturating_sub(beside), begin)?;
+    let right = profile.line(end, (end + beside).min(profile.len()))?;
+    let (xa, xb) = (profile.edge(begin), profile.edge(end));
+    let (ha, hb) = (left.at(xa), right.at(xb));
+    let over = |i: usize| (profile.heights[i] - ha - (hb - ha) * (profile.x(i) - xa) / (xb - xa)).abs();
+    // The running median of three keeps a single drop from being the crown.
+    let smooth = |i: usize| {
+        let mut three: Vec<f64> =
+            (i.saturating_sub(1)..(i + 2).min(profile.len())).map(over).filter(|h| h.is_finite()).collect();
+        if three.is_empty() { f64::NAN } else { crate::ground::robust::median(&mut three) }
+    };
+    let heights: Vec<f64> = (begin..end).map(smooth).collect();
+    let top = heights.iter().copied().filter(|h| h.is_finite()).fold(0.0, f64::max);
+    let last = heights.iter().rposition(|&h| h >= FLANK_FROM * top)? + begin;
+    Some(last.min(end.saturating_sub(FLANK_BINS)).max(begin))
+}
+
+/// The boundary with the least sum of squares, and the range of those that are as plausible.
+fn search(profile: &Profile, from: usize, to: usize, sigma: f64, band: Option<[f64; 2]>) -> Option<(usize, [f64; 2])> {
+    let (low, high) = band.map_or((from + 3, to - 4), |[low, high]| {
+        (profile.boundary(low).max(from + 3), profile.boundary(high).min(to - 4))
+    });
+    let costs: Vec<(usize, f64)> = (low..=high)
+        .filter_map(|at| Some((at, profile.parabola(from, at)?.sse + profile.parabola(at, to)?.sse)))
+        .collect();
+    let &(best, least) = costs.iter().min_by(|a, b| a.1.total_cmp(&b.1))?;
+    let count = profile.count(from, to);
+    let variance = (least / (count - 6.0).max(1.0)).max(sigma * sigma);
+    let plausible = costs.iter().filter(|c| c.1 <= least + PLAUSIBLE * variance).map(|c| profile.edge(c.0));
+    let range = plausible.fold([f64::INFINITY, f64::NEG_INFINITY], |r, x| [r[0].min(x), r[1].max(x)]);
+    Some((best, range))
+}

@@ -1,0 +1,184 @@
+//! The undisturbed part of a wall: grown inward from the edge of the view as long as it is a straight wall that a weld has
+//! drawn in. Right-hand walls: the toe lies at smaller x.
+//!
+//! A girth weld shrinks and draws both pipes in. A thin shell under a ring load bends as `exp(-βz)(cos βz + sin βz)` with
+//! `β = 1.285/√(R t)` (Timoshenko, Theory of Plates and Shells, §114, ν = 0.3), so that this term belongs to an undisturbed
+//! wall, with an amplitude of some tenths of a millimetre. What a wall departs from it is judged by what drawn pipes wave,
+//! never by the scanner's noise: a better scanner must not measure less.
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::profile::Profile;
+
+/// What drawn walls wave, 2.5 times 0.05 mm: a wall that departs further is another surface.
+pub(crate) const TOLERANCE_MM: f64 = 0.12;
+/// Amplitude of weld shrinkage, one sigma: half a millimetre is much.
+const SHRINKAGE_MM: f64 = 0.25;
+/// The first stretch of a wall, and as a part of its side.
+const FIRST_MM: f64 = 15.0;
+const FIRST_PART: f64 = 0.25;
+/// It grows by so much, and the mean over so much tells whether it may.
+const GROWTH_MM: f64 = 2.0;
+const BLOCK_MM: f64 = 3.0;
+/// Unevenness counts as one value per this length: drawn and rolled walls wave over centimetres.
+const WAVE_MM: f64 = 15.0;
+
+/// Timoshenko's shell term at a distance from the ring that draws it in.
+pub(crate) fn shell_term(distance_mm: f64, radius_mm: f64, thickness_mm: f64) -> f64 {
+    let x = 1.285 * distance_mm.abs() / (radius_mm * thickness_mm).sqrt();
+    (-x).exp() * (x.cos() + x.sin())
+}
+
+/// An undisturbed wall of one station.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct WallRun {
+    /// From where it is undisturbed, and to where it was looked at.
+    pub from: f64,
+    pub to: f64,
+    /// Of its straight line: height at the centreline, and slope.
+    pub height: f64,
+    pub slope: f64,
+    /// Amplitude of the shrinkage at the centreline.
+    pub shrinkage: f64,
+    pub rms: f64,
+    /// Standard uncertainty of the slope.
+    pub slope_u: f64,
+    pub(crate) centre: f64,
+    pub(crate) shell_mm: [f64; 2],
+}
+
+impl WallRun {
+    /// The straight wall without its shrinkage.
+    pub fn straight(&self, x: f64) -> f64 {
+        self.height + self.slope * (x - self.centre)
+    }
+
+    /// The wall with its shrinkage.
+    pub fn at(&self, x: f64) -> f64 {
+        self.straight(x) + self.shrinkage * shell_term(x - self.centre, self.shell_mm[0], self.shell_mm[1])
+    }
+}
+
+/// What a wall may depart from its line, for cells of this noise.
+pub(super) fn tolerance(sigma: f64) -> f64 {
+    // A block of 3 mm is of five bins and more.
+    TOLERANCE_MM.max(4.0 * sigma / 5f64.sqrt())
+}
+
+/// Grows the wall to the right of `toe` from the edge of the view; `None` where no stretch of it is one.
+pub(super) fn grow(profile: &Profile, toe: f64, centre: f64, shell_mm: [f64; 2], sigma: f64) -> Option<WallRun> {
+    let side = Side::of(profile, toe, centre, shell_mm);
+    let end = profile.edge(side.bins.last()?.index + 1);
+    let tolerance = tolerance(sigma);
+    let first = FIRST_MM.max(FIRST_PART * (end - toe)).min(end - toe);
+    let mut to = end;
+    let mut run = loop {
+        let from = (to - first).max(toe);
+        let run = side.fit(from, to, sigma)?;
+        if side.blocks(from, to, &run).all(|mean| mean.abs() <= tolerance) {
+            break run;
+        }
+        to -= GROWTH_MM;
+        if to - first < toe - 0.5 * GROWTH_MM {
+            return None;
+        }
+    };
+    while run.from > toe {
+        let from = (run.from - GROWTH_MM).max(toe);
+        let Some(longer) = side.fit(from, to, sigma) else { break };
+        if side.blocks(from, from + BLOCK_MM, &longer).any(|mean| mean.abs() > tolerance) {
+            break;
+        }
+        run = longer;
+    }
+    Some(run)
+}
+
+/// A bin of a side that holds points.
+#[derive(Debug, Clone, Copy)]
+struct SideBin {
+    index: usize,
+    /// From the centreline.
+    z: f64,
+    height: f64,
+    shell: f64,
+}
+
+/// All that lies to the right of a toe.
+struct Side<'a> {
+    profile: &'a Profile,
+    bins: Vec<SideBin>,
+    centre: f64,
+    shell_mm: [f64; 2],
+}
+
+impl<'a> Side<'a> {
+    fn of(profile: &'a Profile, toe: f64, centre: f64, shell_mm: [f64; 2]) -> Self {
+        let one = |index: usize| {
+            let z = profile.x(index) - centre;
+            SideBin { index, z, height: profile.heights[index], shell: shell_term(z, shell_mm[0], shell_mm[1]) }
+        };
+        let bins = (profile.boundary(toe)..profile.len()).map(one).filter(|b| b.height.is_finite()).collect();
+        Self { profile, bins, centre, shell_mm }
+    }
+
+    fn between(&self, from: f64, to: f64) -> &[SideBin] {
+        let (first, last) = (self.profile.boundary(from), self.profile.boundary(to));
+        let at = |boundary: usize| self.bins.partition_point(|b| b.index < boundary);
+        &self.bins[at(first)..at(last).max(at(first))]
+    }
+
+    /// Mean residuals of the blocks of [from, to).
+    fn blocks(&self, from: f64, to: f64, run: &WallRun) -> impl Iterator<Item = f64> {
+        let wide = self.profile.in_bins(BLOCK_MM);
+        let first = self.profile.boundary(from);
+        let run = *run;
+        self.between(from, to).chunk_by(move |a, b| (a.index - first) / wide == (b.index - first) / wide).map(
+            move |block| {
+                let off = |b: &SideBin| b.height - run.height - run.slope * b.z - run.shrinkage * b.shell;
+                block.iter().map(off).sum::<f64>() / block.len() as f64
+            },
+        )
+    }
+
+    fn fit(&self, from: f64, to: f64, sigma: f64) -> Option<WallRun> {
+        let bins = self.between(from, to);
+        if bins.len() < 4 {
+            return None;
+        }
+        // The slope is counted from the run's own middle, so that the sums do not cancel.
+        let middle = 0.5 * (from + to) - self.centre;
+        let row = |b: &SideBin| Vector3::new(1.0, b.z - middle, b.shell);
+        let (mut normal, mut right, mut square) = (Matrix3::zeros(), Vector3::zeros(), 0.0);
+        for b in bins {
+            let r = row(b);
+            normal += r * r.transpose();
+            right += r * b.height;
+            square += b.height * b.height;
+        }
+        let solve = |variance: f64| {
+            let mut a = normal;
+            a[(2, 2)] += variance / (SHRINKAGE_MM * SHRINKAGE_MM);
+            let inverse = a.cholesky()?.inverse();
+            let c = inverse * right;
+            let sse = (square - 2.0 * c.dot(&right) + c.dot(&(normal * c))).max(0.0);
+            Some((c, inverse, (sse / bins.len() as f64).sqrt()))
+        };
+        // Waves count as one value per their length.
+        let effective = |rms: f64| rms.max(sigma).max(1e-6).powi(2) * (WAVE_MM / self.profile.bin).max(1.0);
+        let (_, _, rms) = solve(effective(sigma))?;
+        let variance = effective(rms);
+        let (c, inverse, rms) = solve(variance)?;
+        Some(WallRun {
+            from,
+            to,
+            height: c[0] - c[1] * middle,
+            slope: c[1],
+            shrinkage: c[2],
+            rms,
+            slope_u: (variance * inverse[(1, 1)]).sqrt(),
+            centre: self.centre,
+            shell_mm: self.shell_mm,
+        })
+    }
+}

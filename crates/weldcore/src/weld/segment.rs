@@ -1,0 +1,439 @@
+//! A scanned part into reference wall, other wall and bead, without seeds.
+//!
+//! The shot is unrolled about the pipe: angle, axial coordinate, radial deviation. [`crate::weld::sections`] finds cap, toes and
+//! undisturbed walls in it, station by station; every point gets a fate by them. The reference wall's cylinder is then
+//! fitted to its undisturbed points, with the weld's shrinkage taken out, and all is counted from it.
+
+use super::coarse::{Nominal, coarse_frame};
+use super::label::{Fate, Label};
+use super::pipe_frame::{PipeFrame, Unrolled};
+use crate::error::{Error, Result, require_positive};
+use crate::ground::robust::median;
+use crate::ground::threads;
+use crate::ground::transform::Vec3;
+use crate::surfaces::{PointNoise, cylinder};
+use crate::weld::sections::{self, Sections, Station, TOLERANCE_MM, shell_term};
+
+/// A segmented shot.
+#[derive(Debug, Clone)]
+pub struct Segmentation {
+    /// The reference wall's cylinder with its origins.
+    pub frame: PipeFrame,
+    /// A [`Label`] per point.
+    pub labels: Vec<u8>,
+    /// The points in `frame`.
+    pub unrolled: Unrolled,
+    /// Noise of one point across the wall (robust, 1 sigma).
+    pub noise_mm: f64,
+    /// Mean distance between the toes.
+    pub bead_width_mm: f64,
+    /// Whether the radius was fitted; otherwise the arc was too short for it and it is the nominal one.
+    pub radius_fitted: bool,
+    /// A [`Fate`] per point.
+    pub fates: Vec<u8>,
+    /// Of the nominal wall.
+    pub thickness_mm: f64,
+    /// The cross-sections along the seam.
+    pub sections: Sections,
+}
+
+/// Points further from the pipe than this many wall thicknesses are something else: neither a step nor the
+/// reinforcement of a weld comes near.
+const GATE_THICKNESSES: f64 = 2.0;
+/// The strip on which the cap's flank throws light of its own (it pulls the phase by micrometres), in heights of the cap:
+/// on two sessions with such light the step moves by 0.003 mm at one height, and no more from 1.7 on.
+const STRIP_HEIGHTS: f64 = 1.7;
+/// Points so many stations beyond the outermost ones, in the corners of a view, are held against those.
+const CORNER_STATIONS: f64 = 4.0;
+/// How far the real diameter of a pipe may be from its nominal one, relative (the usual delivery tolerance is 1 %). A
+/// radius that the arc does not determine better than this is taken as nominal.
+const DIAMETER_TOLERANCE: f64 = 0.01;
+/// A radius this far from the nominal one, relative, is another pipe's: ovality bends a pipe locally by a few per cent.
+const OTHER_PIPE: f64 = 0.2;
+/// Points that the cylinder of the reference wall is fitted to.
+const FIT_POINTS: usize = 40_000;
+
+/// Segments one shot. `points` is a pixel grid `width` wide, row-major, NaN where there is no point.
+///
+/// # Errors
+/// [`Error::Shape`], [`Error::OutOfRange`] on bad arguments; [`Error::TooFew`] where there is next to nothing;
+/// [`Error::NotFound`] with the reason where no weld, or only one wall, is in view.
+pub fn segment(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<Segmentation> {
+    require_positive("pipe radius", nominal.radius_mm)?;
+    require_positive("wall thickness", nominal.wall_thickness_mm)?;
+    if width == 0 || !points.len().is_multiple_of(width) {
+        let (expected, got) = (format!("rows of {width} pixels"), format!("{} pixels", points.len()));
+        return Err(Error::Shape { what: "points", expected, got });
+    }
+    crate::ground::memory::require(points.len(), 80);
+    let coarse = coarse_frame(points, width, nominal)?;
+    let unrolled = Unrolled::of(points, &coarse);
+    let thickness = nominal.wall_thickness_mm;
+    let mut sections = sections::examine(&unrolled, &coarse, thickness, GATE_THICKNESSES * thickness)?;
+    let (fates, labels) = sort_points(&sections, &unrolled, thickness);
+    let wall = undrawn(points, &labels, &unrolled, &sections, &coarse, thickness);
+    let (frame, radius_fitted) = reference_frame(&wall, &coarse, nominal)?;
+    let frame = PipeFrame { origin_mm: frame.origin_mm + frame.axis * centreline(&sections, &coarse, &frame), ..frame };
+    reframe(&mut sections, &coarse, &frame);
+    Ok(Segmentation {
+        frame,
+        labels,
+        fates,
+        unrolled: Unrolled::of(points, &frame),
+        noise_mm: sections.noise_mm,
+        bead_width_mm: sections.cap_width_mm,
+        radius_fitted,
+        thickness_mm: thickness,
+        sections,
+    })
+}
+
+/// What became of every point, from the sections: its [`Fate`] and its [`Label`].
+fn sort_points(sections: &Sections, unrolled: &Unrolled, thickness_mm: f64) -> (Vec<u8>, Vec<u8>) {
+    let grid = &sections.grid;
+    let own: Vec<Option<Bed>> = (0..sections.stations.len()).map(|k| Bed::of(sections, k)).collect();
+    // What little a station without a weld of its own holds is held against its neighbour's.
+    let beds: Vec<Option<(usize, Bed)>> = (0..own.len())
+        .map(|k| {
+            let mut near = (0..=4).flat_map(|d: usize| [k.wrapping_sub(d), k + d]);
+            near.find_map(|j| Some((j, (*own.get(j)?)?)))
+        })
+        .collect();
+    let tolerance = TOLERANCE_MM.max(5.0 * sections.noise_mm) + 4.0 * sections.noise_mm;
+    let gate = GATE_THICKNESSES * thickness_mm;
+    let sort = |i: usize| -> (Fate, Label) {
+        let p = grid.place(unrolled, i);
+        if !p.height.is_finite() {
+            return (Fate::None, Label::None);
+        }
+        // Beyond the pipe's arc there is nothing of the seam.
+        let Some(k) = grid.station_within(p.along, CORNER_STATIONS) else { return (Fate::Other, Label::None) };
+        let Some((k, bed)) = beds[k] else {
+            return (if p.height.abs() > gate { Fate::Gated } else { Fate::Other }, Label::None);
+        };
+        let side = usize::from(p.across > 0.5 * (bed.toes[0] + bed.toes[1]));
+        let out = if side == 0 { bed.toes[0] - p.across } else { p.across - bed.toes[1] };
+        let off = sections.stations[k].wall_at(side, p.across).map_or(p.height, |wall| p.height - wall);
+        if out <= 0.0 {
+            let fate = if off.abs() > gate + bed.height { Fate::Gated } else { Fate::Cap };
+            return (fate, Label::Bead);
+        }
+        if off.abs() > gate {
+            return (Fate::Gated, Label::None);
+        }
+        let Some(begin) = bed.undisturbed[side] else { return (Fate::Other, Label::None) };
+        let end = bed.ends[side];
+        let fits = off.abs() <= tolerance;
+        let fate = match (out, fits) {
+            (_, true) => Fate::Wall,
+            (out, _) if out > end + grid.bin_mm => Fate::Other,
+            (out, false) if out < begin => Fate::Transition,
+            _ => Fate::OffLine,
+        };
+        let label = match (fate, out < STRIP_HEIGHTS * bed.height) {
+            (Fate::Wall, true) => Label::Bead,
+            (Fate::Wall, false) if out >= begin - grid.bin_mm => [Label::ReferenceWall, Label::OtherWall][side],
+            _ => Label::None,
+        };
+        (fate, label)
+    };
+    let parts = threads::map_ranges(unrolled.angle_rad.len(), |range| {
+        range.map(sort).map(|(fate, label)| (fate as u8, label as u8)).unzip::<u8, u8, Vec<u8>, Vec<u8>>()
+    });
+    let (fates, labels): (Vec<Vec<u8>>, Vec<Vec<u8>>) = parts.into_iter().unzip();
+    (fates.concat(), labels.concat())
+}
+
+/// What the points of one station are held against.
+#[derive(Debug, Clone, Copy)]
+struct Bed {
+    toes: [f64; 2],
+    height: f64,
+    /// From where each wall is undisturbed, mm outward of its toe: the median of five stations, so that one that a wave or a
+    /// drop of spatter stopped loses no wall.
+    undisturbed: [Option<f64>; 2],
+    /// How far out it was looked at.
+    ends: [f64; 2],
+}
+
+impl Bed {
+    fn of(sections: &Sections, k: usize) -> Option<Self> {
+        let stations = &sections.stations;
+        let own = &stations[k];
+        let toes = own.toes_mm?;
+        let near = &stations[k.saturating_sub(2)..(k + 3).min(stations.len())];
+        let outward = |s: &Station, side: usize| {
+            let (toes, from) = (s.toes_mm?, s.undisturbed_mm[side]?);
+            Some(if side == 0 { toes[0] - from } else { from - toes[1] })
+        };
+        let undisturbed = std::array::from_fn(|side| {
+            own.undisturbed_mm[side]?;
+            let mut all: Vec<f64> = near.iter().filter_map(|s| outward(s, side)).collect();
+            Some(median(&mut all))
+        });
+        let ends = std::array::from_fn(|side| {
+            own.walls[side].map_or(0.0, |run| run.to - if side == 0 { -toes[0] } else { toes[1] })
+        });
+        Some(Self { toes, height: own.height_mm.abs(), undisturbed, ends })
+    }
+}
+
+/// Where the middle between the toes lies along the axis of `frame`: mean over the stations.
+fn centreline(sections: &Sections, coarse: &PipeFrame, frame: &PipeFrame) -> f64 {
+    let (mut sum, mut count) = (0.0, 0.0);
+    for station in &sections.stations {
+        if let Some([low, high]) = station.toes_mm {
+            sum += frame.unroll(&coarse.point(station.angle_rad, 0.5 * (low + high)).into())[1];
+            count += 1.0;
+        }
+    }
+    sum / f64::max(count, 1.0)
+}
+
+/// The stations in another frame: angles and places along the axis.
+fn reframe(sections: &mut Sections, coarse: &PipeFrame, frame: &PipeFrame) {
+    for station in &mut sections.stations {
+        let angle = station.angle_rad;
+        let across = |x: f64| frame.unroll(&coarse.point(angle, x).into())[1];
+        station.toes_mm = station.toes_mm.map(|toes| toes.map(across));
+        station.undisturbed_mm = station.undisturbed_mm.map(|from| from.map(across));
+        station.angle_rad = frame.unroll(&coarse.point(angle, 0.0).into())[0];
+    }
+    for doubt in &mut sections.doubts {
+        doubt.angle_rad = frame.unroll(&coarse.point(doubt.angle_rad, 0.0).into())[0];
+    }
+}
+
+/// Points of the reference wall with the weld's shrinkage taken out, so that they lie on a cylinder.
+fn undrawn(
+    points: &[[f64; 3]],
+    labels: &[u8],
+    unrolled: &Unrolled,
+    sections: &Sections,
+    coarse: &PipeFrame,
+    thickness_mm: f64,
+) -> Vec<[f64; 3]> {
+    // One amplitude: that of a single station is known too badly.
+    let mut all: Vec<f64> = sections.stations.iter().filter_map(|s| s.walls[0].map(|run| run.shrinkage)).collect();
+    let drawn = if all.is_empty() { 0.0 } else { median(&mut all) };
+    let mut middles: Vec<f64> =
+        sections.stations.iter().filter_map(|s| s.toes_mm.map(|t| 0.5 * (t[0] + t[1]))).collect();
+    let middle = if middles.is_empty() { 0.0 } else { median(&mut middles) };
+    let square = coarse.axis.cross(&coarse.zero);
+    let wall = (0..points.len()).filter(|&i| labels[i] == Label::ReferenceWall as u8);
+    wall.map(|i| {
+        let (sin, cos) = f64::from(unrolled.angle_rad[i]).sin_cos();
+        let z = f64::from(unrolled.axial_mm[i]) - middle;
+        let lift = -drawn * shell_term(z, coarse.radius_mm, thickness_mm);
+        (Vec3::from(points[i]) + (coarse.zero * cos + square * sin) * lift).into()
+    })
+    .collect()
+}
+
+/// The reference wall's cylinder by orthogonal distance, with what its arc allows: a free radius where it is determined
+/// to better than the pipe's delivery tolerance, else the nominal one.
+fn reference_frame(wall: &[[f64; 3]], coarse: &PipeFrame, nominal: &Nominal) -> Result<(PipeFrame, bool)> {
+    crate::error::require_count("points of the reference wall", 100, wall.len())?;
+    let sample: Vec<[f64; 3]> = wall.iter().step_by(wall.len().div_ceil(FIT_POINTS)).copied().collect();
+    let start = cylinder::Cylinder { point_mm: coarse.origin_mm, axis: coarse.axis, radius_mm: coarse.radius_mm };
+    let fixed = cylinder::refine(&sample, start, false, PointNoise::default())?.surface;
+    let free = cylinder::refine(&sample, fixed, true, PointNoise::default()).ok().filter(|fit| {
+        let last = fit.covariance.nrows() - 1;
+        let sigma = fit.covariance[(last, last)].sqrt();
+        // The residuals of a wall are correlated: their number counts for far less than it says, see `step`.
+        let doubt = sigma * (sample.len() as f64 / 100.0).sqrt();
+        doubt < DIAMETER_TOLERANCE * nominal.radius_mm
+    });
+    if let Some(fit) = &free
+        && (fit.surface.radius_mm / nominal.radius_mm - 1.0).abs() > OTHER_PIPE
+    {
+        let (seen, told) = (fit.surface.radius_mm, nominal.radius_mm);
+        let reason =
+            format!("the reference wall's radius is {seen:.1} mm, not {told:.1} mm as the part's description says");
+        return Err(Error::Degenerate { what: "pipe", reason });
+    }
+    let (surface, fitted) = free.map_or((fixed, false), |fit| (fit.surface, true));
+    let axis = if surface.axis.dot(&coarse.axis) < 0.0 { -surface.axis } else { surface.axis };
+    // The point of the axis next to the coarse origin.
+    let origin = surface.point_mm + axis * axis.dot(&(coarse.origin_mm - surface.point_mm));
+    Ok((PipeFrame::new(origin, axis, coarse.zero, surface.radius_mm)?, fitted))
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    /// A pipe's weld as a scanner sees it from outside, made point by point from the closed form, not by the simulator.
+    #[derive(Clone, Copy)]
+    pub(crate) struct Example {
+        pub radius_mm: f64,
+        /// Offset of the other wall's axis.
+        pub offset_mm: [f64; 2],
+        pub radius_difference_mm: f64,
+        pub tilt: [f64; 2],
+        pub bead_width_mm: f64,
+        pub bead_height_mm: f64,
+        pub noise_mm: f64,
+        pub half_arc_rad: f64,
+        /// Extent along the axis of the reference wall's side and of the other wall's.
+        pub reach_mm: [f64; 2],
+        pub seed: u64,
+    }
+
+    pub(crate) const EXAMPLE: Example = Example {
+        radius_mm: 315.0,
+        offset_mm: [0.45, 0.1],
+        radius_difference_mm: 0.0,
+        tilt: [0.0, 0.0],
+        bead_width_mm: 11.0,
+        bead_height_mm: 1.8,
+        noise_mm: 0.04,
+        half_arc_rad: 0.25,
+        reach_mm: [90.0, 100.0],
+        seed: 1,
+    };
+
+    pub(crate) const COLUMNS: usize = 400;
+    pub(crate) const ROWS: usize = 300;
+    /// Towards the scanner: where the middle of the view lies about the axis.
+    pub(crate) const MIDDLE_RAD: f64 = 2.0;
+
+    fn uniform(state: &mut u64) -> f64 {
+        *state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        ((*state >> 11) as f64 + 0.5) / (1_u64 << 53) as f64
+    }
+
+    pub(crate) fn normal_random(state: &mut u64) -> f64 {
+        (-2.0 * uniform(state).ln()).sqrt() * (std::f64::consts::TAU * uniform(state)).cos()
+    }
+
+    impl Example {
+        /// Radial step at an angle, by the exact radial distance of an eccentric circle.
+        pub(crate) fn step_mm(&self, angle: f64, axial: f64) -> f64 {
+            let e: Vec<f64> = (0..2).map(|k| self.offset_mm[k] + self.tilt[k] * axial).collect();
+            let (along, across) = (e[0] * angle.cos() + e[1] * angle.sin(), e[1] * angle.cos() - e[0] * angle.sin());
+            let radius = self.radius_mm + self.radius_difference_mm;
+            along + (radius * radius - across * across).sqrt() - self.radius_mm
+        }
+
+        /// The axis runs along +x of the scanner, whose z looks at the pipe; angle 0 is `zero`.
+        pub(crate) fn frame(&self) -> PipeFrame {
+            let origin = Vec3::new(3.0, -2.0, 420.0 + self.radius_mm);
+            let toward = Vec3::new(0.0, 0.0, -1.0);
+            let axis = Vec3::x();
+            // zero turned by MIDDLE_RAD about the axis is `toward`.
+            let zero = toward * MIDDLE_RAD.cos() - axis.cross(&toward) * MIDDLE_RAD.sin();
+            PipeFrame::new(origin, axis, zero, self.radius_mm).unwrap()
+        }
+
+        pub(crate) fn nominal(&self) -> Nominal {
+            let frame = self.frame();
+            Nominal {
+                radius_mm: self.radius_mm,
+                wall_thickness_mm: 6.0,
+                axis: Some(frame.axis),
+                zero: Some(frame.zero),
+            }
+        }
+
+        pub(crate) fn points(&self) -> Vec<[f64; 3]> {
+            let frame = self.frame();
+            let square = frame.axis.cross(&frame.zero);
+            let mut state = self.seed;
+            let mut points = Vec::new();
+            for r in 0..ROWS {
+                for c in 0..COLUMNS {
+                    let angle = MIDDLE_RAD + self.half_arc_rad * (2.0 * (r as f64 + 0.5) / ROWS as f64 - 1.0);
+                    let part = (c as f64 + 0.5) / COLUMNS as f64;
+                    let axial = -self.reach_mm[0] + part * (self.reach_mm[0] + self.reach_mm[1]);
+                    let half = self.bead_width_mm / 2.0;
+                    let mut height = if axial > 0.0 { self.step_mm(angle, axial) } else { 0.0 };
+                    if axial.abs() < half {
+                        let t = axial / half;
+                        height =
+                            self.step_mm(angle, axial) * (t + 1.0) / 2.0 + self.bead_height_mm * (1.0 - t * t).powi(2);
+                    }
+                    let radius = self.radius_mm + height + self.noise_mm * normal_random(&mut state);
+                    let p = frame.origin_mm
+                        + frame.axis * axial
+                        + (frame.zero * angle.cos() + square * angle.sin()) * radius;
+                    points.push(p.into());
+                }
+            }
+            points
+        }
+    }
+
+    fn share(labels: &[u8], wanted: Label, truth: impl Fn(f64) -> bool, e: &Example) -> f64 {
+        let axial =
+            |i: usize| -e.reach_mm[0] + ((i % COLUMNS) as f64 + 0.5) / COLUMNS as f64 * (e.reach_mm[0] + e.reach_mm[1]);
+        let inside: Vec<usize> = (0..labels.len()).filter(|&i| truth(axial(i))).collect();
+        inside.iter().filter(|&&i| labels[i] == wanted as u8).count() as f64 / inside.len() as f64
+    }
+
+    #[test]
+    fn walls_and_bead_are_told_apart_on_pipes_of_any_size() {
+        for (radius_mm, bead_width_mm, half_arc_rad) in [(54.0, 6.0, 0.8), (315.0, 11.0, 0.25), (610.0, 24.0, 0.12)] {
+            let e = Example { radius_mm, bead_width_mm, half_arc_rad, ..EXAMPLE };
+            let s = segment(&e.points(), COLUMNS, &e.nominal()).unwrap();
+            // A bead's height (1.8 mm) and two bins beside the toes are left to the flank.
+            let half = bead_width_mm / 2.0;
+            let shares = [
+                share(&s.labels, Label::ReferenceWall, |z| z < -half - 8.0, &e),
+                share(&s.labels, Label::OtherWall, |z| z > half + 8.0, &e),
+                share(&s.labels, Label::Bead, |z| z.abs() < half - 1.0, &e),
+            ];
+            assert!(shares.iter().all(|s| *s > 0.99), "R {radius_mm}: {shares:?}");
+            assert!(share(&s.labels, Label::Bead, |z| z.abs() > half + 8.0, &e) < 0.01, "R {radius_mm}");
+            assert!(s.frame.origin_mm.x - 3.0 < 0.5 && s.frame.axis.dot(&Vec3::x()) > 0.999_99, "R {radius_mm}");
+        }
+    }
+
+    #[test]
+    fn the_axis_need_not_be_known() {
+        let e = EXAMPLE;
+        let nominal = Nominal { axis: None, zero: None, ..e.nominal() };
+        let s = segment(&e.points(), COLUMNS, &nominal).unwrap();
+        assert!(s.frame.axis.dot(&Vec3::x()) > 0.999_99);
+        // Angle 0 faces the scanner.
+        assert!(s.frame.zero.dot(&Vec3::new(0.0, 0.0, -1.0)) > 0.999);
+    }
+
+    #[test]
+    fn a_plain_pipe_shows_no_weld() {
+        let e = Example { offset_mm: [0.0; 2], bead_height_mm: 0.0, ..EXAMPLE };
+        let error = segment(&e.points(), COLUMNS, &e.nominal()).unwrap_err();
+        assert!(error.to_string().contains("no weld is in view"), "{error}");
+    }
+
+    #[test]
+    fn a_weld_at_the_edge_of_the_view_leaves_only_one_wall() {
+        for reach_mm in [[150.0, 3.0], [150.0, 9.0], [9.0, 150.0], [1.0, 150.0]] {
+            let e = Example { reach_mm, ..EXAMPLE };
+            let error = segment(&e.points(), COLUMNS, &e.nominal()).map(|s| s.bead_width_mm).unwrap_err();
+            assert!(error.to_string().contains("only one wall"), "{reach_mm:?}: {error}");
+        }
+    }
+
+    #[test]
+    fn a_weld_ground_flush_shows_by_its_step() {
+        let e = Example { bead_height_mm: 0.0, bead_width_mm: 1.0, offset_mm: [-0.8, 0.0], ..EXAMPLE };
+        let s = segment(&e.points(), COLUMNS, &e.nominal()).unwrap();
+        assert!(share(&s.labels, Label::ReferenceWall, |z| z < -4.0, &e) > 0.98);
+        assert!(share(&s.labels, Label::OtherWall, |z| z > 4.0, &e) > 0.98);
+    }
+
+    #[test]
+    fn rubbish_is_refused_without_a_panic() {
+        let nominal = EXAMPLE.nominal();
+        assert!(segment(&[], 1, &nominal).is_err());
+        assert!(segment(&[[f64::NAN; 3]; 10_000], 100, &nominal).is_err());
+        assert!(segment(&[[1.0; 3]; 10_000], 100, &nominal).is_err());
+        assert!(segment(&EXAMPLE.points(), 7, &nominal).is_err());
+        assert!(segment(&EXAMPLE.points(), COLUMNS, &Nominal { radius_mm: -1.0, ..nominal }).is_err());
+        let mut state = 3;
+        let noise: Vec<[f64; 3]> =
+            (0..40_000).map(|_| std::array::from_fn(|_| 400.0 * normal_random(&mut state))).collect();
+        assert!(segment(&noise, 200, &nominal).is_err());
+    }
+}

@@ -31,6 +31,8 @@ __all__ = [
     "WeldSurface",
     "WrappedPhase",
     "__version__",
+    "_put_together",
+    "_take_apart",
     "calibrate_reference_plane",
     "decode",
     "decode_gray",
@@ -548,3 +550,7 @@ def place_shots(
     NDArray[np.float32],
     NDArray[np.uint16],
 ]: ...
+
+# How pickle and copy take the core's objects apart and put them together.
+def _take_apart(object: Any) -> tuple[Any, tuple[str, str, Any]]: ...
+def _put_together(name: str, version: str, state: Any) -> Any: ...

@@ -82,7 +82,11 @@ impl CylinderUnknowns {
     #[inline(always)]
     fn across<T: Number>(&self, q: &[T; 3]) -> ([T; 4], T) {
         let d: [T; 3] = std::array::from_fn(|k| q[k] - T::of(self.point[k]));
-        let [x, y, t] = self.axes.map(|a| T::of(a[0]) * d[0] + T::of(a[1]) * d[1] + T::of(a[2]) * d[2]);
+        let along = |a: usize| {
+            let axis = &self.axes[a];
+            T::of(axis[0]) * d[0] + T::of(axis[1]) * d[1] + T::of(axis[2]) * d[2]
+        };
+        let (x, y, t) = (along(0), along(1), along(2));
         let r = (x * x + y * y).sqrt();
         let s = r.pull();
         let (x, y) = (x * s, y * s);

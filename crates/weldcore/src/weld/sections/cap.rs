@@ -115,10 +115,17 @@ fn candidate(profile: &Profile, from: usize, to: usize, beside: usize, sigma: f6
         return None;
     }
     let quarter = ((to - from) / 4).max(3);
-    let (inner_left, inner_right) = (profile.line(from, from + quarter)?, profile.line(to - quarter, to)?);
-    let turn = [sign * (inner_left.slope - left.slope), sign * (right.slope - inner_right.slope)];
-    let se = |a: &Line, b: &Line| sigma * (1.0 / a.sxx + 1.0 / b.sxx).sqrt();
-    let doubt = [se(&inner_left, &left), se(&inner_right, &right)];
+    // A scanner that leans does not see the flank behind the crown: its slope is then that of the way up to what is seen.
+    let flank = |seen: Option<Line>, beyond: Option<Line>, toe: [f64; 2]| {
+        let slope = |l: Line| (l.slope, 1.0 / l.sxx);
+        let way_up = |l: Line| ((l.h - toe[1]) / (l.x - toe[0]), 1.0 / (l.count * (l.x - toe[0]).powi(2)));
+        seen.map(slope).or_else(|| beyond.map(way_up))
+    };
+    let rising = flank(profile.line(from, from + quarter), profile.line(from + quarter, middle), [xa, ha])?;
+    let falling = flank(profile.line(to - quarter, to), profile.line(middle, to - quarter), [xb, hb])?;
+    let turn = [sign * (rising.0 - left.slope), sign * (right.slope - falling.0)];
+    let se = |flank: f64, beside: &Line| sigma * (flank + 1.0 / beside.sxx).sqrt();
+    let doubt = [se(rising.1, &left), se(falling.1, &right)];
     let (least, most) = (turn[0].min(turn[1]), turn[0].max(turn[1]));
     let weaker = if turn[0] < turn[1] { doubt[0] } else { doubt[1] };
     if least <= 0.6 * KINK_RAD + 1.5 * weaker
@@ -206,15 +213,23 @@ pub(super) struct Jump {
 
 /// Lines beside a jump.
 const JUMP_BESIDE_MM: f64 = 6.0;
+/// And this part of so much on either side of it holds points.
+const JUMP_NEAR_MM: f64 = 1.5;
+const JUMP_SEEN_PART: f64 = 0.5;
 
 pub(super) fn jumps(profile: &Profile, sigma: f64) -> Vec<Jump> {
-    let beside = profile.in_bins(JUMP_BESIDE_MM);
+    let (beside, near) = (profile.in_bins(JUMP_BESIDE_MM), profile.in_bins(JUMP_NEAR_MM));
     let mut all: Vec<Jump> = Vec::new();
     for at in beside..profile.len().saturating_sub(beside) {
         let (Some(left), Some(right)) = (profile.line(at - beside, at), profile.line(at, at + beside)) else {
             continue;
         };
         let x = profile.edge(at);
+        // A jump over a gap is what the gap hides: a flank behind its crown, not an edge.
+        let gap = [at.saturating_sub(near)..at, at..(at + near).min(profile.len())];
+        if gap.into_iter().any(|g| profile.count(g.start, g.end) < JUMP_SEEN_PART * near as f64) {
+            continue;
+        }
         let scatter = left.rms().max(right.rms()).max(sigma);
         all.push(Jump { at: x, strength: (right.at(x) - left.at(x)).abs() / scatter });
     }
@@ -229,4 +244,36 @@ pub(super) fn jumps(profile: &Profile, sigma: f64) -> Vec<Jump> {
         }
     }
     kept
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A cap 8 mm wide and 0.9 mm high with its middle at 0; what lies between `hidden` is not seen.
+    fn leaning(hidden: [f64; 2]) -> Profile {
+        let height = |x: f64| if x.abs() < 4.0 { 0.9 * (1.0 - (x / 4.0).abs().powf(2.5)) } else { 0.0 };
+        let seen = |x: f64| if (hidden[0]..hidden[1]).contains(&x) { f64::NAN } else { height(x) };
+        Profile::new(-40.0, 0.4, (0..200).map(|i| seen(-39.8 + 0.4 * f64::from(i))).collect())
+    }
+
+    #[test]
+    fn a_cap_whose_flank_hides_behind_its_crown_is_a_cap() {
+        for hidden in [[0.0, 0.0], [-4.4, -2.0], [2.0, 4.4]] {
+            let found = candidates(&leaning(hidden), 20.0, 0.01, 1.0);
+            let best = found.first().unwrap_or_else(|| panic!("no cap with {hidden:?} hidden"));
+            assert!(best.middle().abs() < 1.0 && (best.width() - 8.0).abs() < 1.6, "{best:?}");
+        }
+    }
+
+    #[test]
+    fn a_gap_is_no_jump() {
+        let step = |hidden: f64| {
+            let height = |x: f64| if x < 0.0 { 0.0 } else { 0.7 };
+            let seen = |x: f64| if x.abs() < hidden { f64::NAN } else { height(x) };
+            Profile::new(-40.0, 0.4, (0..200).map(|i| seen(-39.8 + 0.4 * f64::from(i))).collect())
+        };
+        assert!(jumps(&step(0.0), 0.01).iter().any(|j| j.at.abs() < 0.3 && j.strength > 20.0));
+        assert!(jumps(&step(1.5), 0.01).iter().all(|j| j.at.abs() > 1.5));
+    }
 }

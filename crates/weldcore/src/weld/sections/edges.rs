@@ -16,7 +16,13 @@ const STRAIGHT_MM: [f64; 5] = [2.0, 3.0, 5.0, 8.0, 12.0];
 const CURVED_MM: [f64; 4] = [3.5, 6.0, 10.0, 16.0];
 /// The first strip beside a toe is held against what was read further out; light of the flank moves it by this much.
 const STRIP_MM: f64 = 1.0;
-const FLANK_LIGHT_MM: f64 = 0.06;
+pub(super) const FLANK_LIGHT_MM: f64 = 0.06;
+/// A bevel that ends within the strip that is not read shows in the line of so much, drawn on to the toe; of three bins at
+/// least.
+const BEVEL_MM: f64 = 0.6;
+const BEVEL_BINS: f64 = 3.0;
+/// A toe may lie so much too far out.
+const INSIDE_MM: f64 = 1.0;
 /// A stretch counts where its far end is seen at least up to this part.
 const SEEN_PART: f64 = 0.7;
 /// The slope beside a toe is that of a line of this length: a shorter one shows the noise.
@@ -40,6 +46,9 @@ pub(super) struct Reading {
     pub slope: f64,
     /// How far the first millimetre beside the toe is off what was read: a bare strip before a tape, or a flare.
     pub strip: f64,
+    /// How far the line of the first strip runs off what was read, drawn on to the toe, or how far metal inside the toe
+    /// lies below it, with its standard uncertainty: a bevel shorter than the strip that is not read.
+    pub bevel: Option<[f64; 2]>,
 }
 
 /// Reads the surface to the right of `toe`, beside a cap of this height; `None` where too little of it is there.
@@ -65,7 +74,21 @@ pub(super) fn read(profile: &Profile, toe: f64, cap_height: f64, sigma: f64) -> 
     let (from, to) = (profile.boundary(toe + CLEAR_MM), profile.boundary(toe + CLEAR_MM + STRIP_MM));
     let strip = profile.mean(from, to).map_or(0.0, |(x, h)| (h - best.value - best.slope * (x - toe)).abs());
     let seen = FLANK_LIGHT_MM + 3.0 * sigma / profile.count(from, to).max(1.0).sqrt();
-    Some(Reading { height: best.value, u, slope, strip: if strip > seen { strip } else { 0.0 } })
+    let strip = if strip > seen { strip } else { 0.0 };
+    // Where bins are empty, the line is of the next ones.
+    let [least, most] = [BEVEL_MM.max(BEVEL_BINS * profile.bin), STRIP_MM.max((BEVEL_BINS + 1.0) * profile.bin)];
+    let mut ends = profile.boundary(toe + CLEAR_MM + least)..=profile.boundary(toe + CLEAR_MM + most);
+    let bevel = ends.find_map(|to| profile.line(from, to)).map(|line| {
+        let se = sigma * (1.0 / line.count + (toe - line.x).powi(2) / line.sxx).sqrt();
+        let at_toe = line.at(toe) - best.value;
+        // Metal of a cap is no lower than the wall: where it is, the toe was taken too far out, over a bevel.
+        let sign = if cap_height < 0.0 { -1.0 } else { 1.0 };
+        let (first, last) = (profile.boundary(toe - INSIDE_MM), profile.boundary(toe));
+        let below = (first..last.saturating_sub(1)).filter_map(|i| profile.mean(i, i + 2));
+        let dip = below.map(|(x, h)| sign * (h - best.value - best.slope * (x - toe))).fold(0.0, f64::min) * sign;
+        if dip.abs() > at_toe.abs() { [dip, sigma] } else { [at_toe, se] }
+    });
+    Some(Reading { height: best.value, u, slope, strip, bevel })
 }
 
 struct StretchFit {
@@ -100,4 +123,31 @@ fn stretch(profile: &Profile, toe: f64, [clear, length]: [f64; 2], degree: usize
         fit = Some(StretchFit { value: c[0], slope: c[1] / length, variance: scale * scale * inverse[(0, 0)] });
     }
     fit
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A cap inside x = 0 and a wall outside that is bevelled down to 0.225 mm at the toe, over 0.9 mm.
+    fn bevelled(slope: f64) -> Profile {
+        let height = |x: f64| if x < 0.0 { -0.9 * slope - 0.9 * x } else { -slope * (0.9 - x).max(0.0) };
+        Profile::new(-3.0, 0.2, (0..120).map(|i| height(-2.9 + 0.2 * f64::from(i))).collect())
+    }
+
+    #[test]
+    fn a_bevel_within_the_unread_strip_is_seen() {
+        let read = |slope: f64, toe: f64| read(&bevelled(slope), toe, 1.0, 0.003).unwrap();
+        let reading = read(0.25, 0.0);
+        assert!(reading.height.abs() < 0.03, "the wall as it is read: {reading:?}");
+        let [off, se] = reading.bevel.unwrap();
+        assert!((off + 0.225).abs() < 0.05 && se < 0.02, "{reading:?}");
+        // The toe taken at the bevel's middle, and nearly at its outer end.
+        for toe in [0.4, 0.8] {
+            let [off, _] = read(0.25, toe).bevel.unwrap();
+            assert!((-0.225..-0.1).contains(&off), "{toe}: {off}");
+        }
+        let [off, _] = read(0.0, 0.0).bevel.unwrap();
+        assert!(off.abs() < 1e-9, "{off}");
+    }
 }

@@ -25,7 +25,9 @@ mod walls;
 pub use cap::widest_cap_mm;
 pub(crate) use grid::Grid;
 pub use station::{Doubt, Edge, Kind, Station};
-pub(crate) use walls::{TOLERANCE_MM, WallRun, shell_term};
+#[cfg(feature = "python")]
+pub(crate) use walls::WallRun;
+pub(crate) use walls::{TOLERANCE_MM, shell_term};
 
 use super::pipe_frame::{PipeFrame, Unrolled};
 use crate::error::{Error, Result};

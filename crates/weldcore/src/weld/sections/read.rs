@@ -20,6 +20,18 @@ const FLUSH_GAPS: [f64; 2] = [0.2, 0.4];
 /// Toes wander by less than this between neighbours, and as a part of the width.
 const WANDER_MM: f64 = 0.6;
 const WANDER_WIDTHS: f64 = 0.06;
+/// A toe that is hidden, a cap's flank of this length inside it and the first of the wall outside, over more than a pixel.
+const HIDDEN_ABOUT_MM: [f64; 2] = [3.0, 1.5];
+const HIDDEN_MM: f64 = 0.8;
+/// Thicker walls are bevelled down to thinner ones by 15 degrees at most (PNAE G-7-009, GOST 16037: 12 to 15).
+const STEEPEST_BEVEL: f64 = 0.27;
+/// What is the wall's own is there in so many neighbours on either side too.
+const NEIGHBOURS: usize = 2;
+/// A median scatters by so much more than a mean.
+const MEDIAN_EFFICIENCY: f64 = 1.25;
+
+/// What the line right beside each toe runs off the reading, with its standard uncertainty; `None` where it is not seen.
+type Bevels = [Option<[f64; 2]>; 2];
 
 impl View<'_> {
     /// A toe of a station: side 0 is the reference wall's.
@@ -61,15 +73,17 @@ impl View<'_> {
                 (0..count).filter_map(|k| Some(toes[k][side]?.at - found.course.at(self.along(k)))).collect();
             if off.is_empty() { 0.0 } else { median(&mut off) }
         });
-        let mut stations: Vec<Station> =
-            threads::install(|| (0..count).into_par_iter().map(|k| self.station(k, found, toes[k], usual)).collect());
+        let (mut stations, bevels): (Vec<Station>, Vec<Bevels>) =
+            threads::install(|| (0..count).into_par_iter().map(|k| self.station(k, found, toes[k], usual)).unzip());
+        let hidden = if found.kind == Kind::Flush { 0.0 } else { self.hidden(&stations) };
         // A ripple of the cap has a foot and a groove too; an end that flares has it in all neighbours.
         let feet: Vec<Option<f64>> = stations.iter().map(|s| s.edge.map(|e| e.foot_mm)).collect();
         for (k, station) in stations.iter_mut().enumerate() {
             if let Some(edge) = &mut station.edge {
-                let mut near: Vec<f64> =
-                    feet[k.saturating_sub(2)..(k + 3).min(feet.len())].iter().flatten().copied().collect();
-                edge.foot_mm = if near.len() == 2 { near[0].min(near[1]) } else { median(&mut near) };
+                let near = k.saturating_sub(NEIGHBOURS)..(k + NEIGHBOURS + 1).min(feet.len());
+                let mut feet: Vec<f64> = feet[near.clone()].iter().flatten().copied().collect();
+                let foot = if feet.len() == 2 { feet[0].min(feet[1]) } else { median(&mut feet) };
+                edge.foot_mm = foot + hidden + bevel(&bevels[near.clone()], 0) + bevel(&bevels[near], 1);
                 edge.hull_mm += edge.foot_mm;
             }
         }
@@ -85,9 +99,10 @@ impl View<'_> {
             for k in 0..toes.len() {
                 let (Some(own), Some(c)) = (at[k], found.course.chosen[k].as_ref()) else { continue };
                 let Some(usual) = running_median(&at, k, 4) else { continue };
-                if (own - usual).abs() > band
-                    && let Some(again) = self.toe(k, c, side, Some([usual - band, usual + band]))
-                {
+                if (own - usual).abs() > band {
+                    // Where a hole is in its place, it is known from its neighbours alone.
+                    let by_neighbours = Toe { at: usual, from: usual - band, to: usual + band };
+                    let again = self.toe(k, c, side, Some([usual - band, usual + band])).unwrap_or(by_neighbours);
                     // What the free search found stays plausible.
                     let first = toes[k][side].map_or([own, own], |t| [t.from, t.to]);
                     let kept = (first[0] - usual).abs().max((first[1] - usual).abs()) <= 2.0 * band;
@@ -99,7 +114,7 @@ impl View<'_> {
         }
     }
 
-    fn station(&self, k: usize, found: &Found, toes: [Option<Toe>; 2], usual: [f64; 2]) -> Station {
+    fn station(&self, k: usize, found: &Found, toes: [Option<Toe>; 2], usual: [f64; 2]) -> (Station, Bevels) {
         let middle = found.course.at(self.along(k));
         let by_course = toes.iter().any(Option::is_none);
         let toes: [Toe; 2] = std::array::from_fn(|side| {
@@ -130,7 +145,7 @@ impl View<'_> {
             walls: [None; 2],
         };
         if !seen {
-            return station;
+            return (station, [None; 2]);
         }
         let shell = [self.grid.radius_mm, self.thickness_mm];
         let centre = 0.5 * (toes[0].at + toes[1].at);
@@ -147,10 +162,10 @@ impl View<'_> {
         for side in 0..2 {
             station.departure_mm[side] = self.departure(k, &station, &toes, side);
         }
-        let (edge, height) = self.edge(k, found, &station, &toes);
-        station.edge = edge;
-        station.height_mm = height;
-        station
+        station.height_mm = if found.kind == Kind::Flush { 0.0 } else { self.cap_height(k, [toes[0].at, toes[1].at]) };
+        let Some((edge, bevels)) = self.edge(k, found, &station, &toes) else { return (station, [None; 2]) };
+        station.edge = Some(edge);
+        (station, bevels)
     }
 
     /// Largest departure of the transition from the straight wall, over blocks of bins. What may as well be the cap's
@@ -168,8 +183,8 @@ impl View<'_> {
             .fold(0.0, f64::max)
     }
 
-    /// The edge step of a station, and the height of its cap.
-    fn edge(&self, k: usize, found: &Found, station: &Station, toes: &[Toe; 2]) -> (Option<Edge>, f64) {
+    /// The edge step of a station, and what is bevelled right beside its toes.
+    fn edge(&self, k: usize, found: &Found, station: &Station, toes: &[Toe; 2]) -> Option<(Edge, Bevels)> {
         let slopes = [station.slope(0), station.slope(1)];
         // Along the bisector of both walls; where one is unknown, along the other.
         let (slope, slope_u) = match slopes {
@@ -180,12 +195,11 @@ impl View<'_> {
             [Some(a), None] | [None, Some(a)] => {
                 (a, station.walls.iter().flatten().map(|r| r.slope_u).fold(0.0, f64::max))
             }
-            [None, None] => return (None, 0.0),
+            [None, None] => return None,
         };
-        let height = if found.kind == Kind::Flush { 0.0 } else { self.cap_height(k, [toes[0].at, toes[1].at]) };
-        let read = |places: [f64; 2]| -> Option<Edge> {
-            let a = edges::read(&self.own[k][0], -places[0], height, self.sigma)?;
-            let b = edges::read(&self.own[k][1], places[1], height, self.sigma)?;
+        let read = |places: [f64; 2]| -> Option<(Edge, Bevels)> {
+            let a = edges::read(&self.own[k][0], -places[0], station.height_mm, self.sigma)?;
+            let b = edges::read(&self.own[k][1], places[1], station.height_mm, self.sigma)?;
             let width = places[1] - places[0];
             let leaning = [(-a.slope - slope).abs(), (b.slope - slope).abs()];
             let doubt = |side: usize| (toes[side].to - toes[side].at).max(toes[side].at - toes[side].from);
@@ -198,25 +212,25 @@ impl View<'_> {
                     + b.strip;
                 (leaning[0] * doubt(0) + leaning[1] * doubt(1), foot)
             };
-            Some(Edge {
+            let edge = Edge {
                 step_mm: b.height - a.height - slope * width,
                 standard_mm: (a.u * a.u + b.u * b.u + (slope_u * width).powi(2)).sqrt(),
                 hull_mm: hull,
                 foot_mm: foot,
-            })
+            };
+            Some((edge, if found.kind == Kind::Flush { [None; 2] } else { [a.bevel, b.bevel] }))
         };
         let middle = 0.5 * (toes[0].at + toes[1].at);
         if found.kind == Kind::Flush {
             // Nobody knows where the toes of a ground weld were: the reading that is furthest from zero counts.
             let gaps = std::iter::once(0.5 * FLUSH_GAP_MM)
                 .chain(FLUSH_GAPS.iter().map(|g| 0.5 * FLUSH_GAP_MM + g * self.widest_mm));
-            let all: Vec<Edge> = gaps.filter_map(|half| read([middle - half, middle + half])).collect();
-            let most = all
-                .iter()
-                .max_by(|a, b| (a.step_mm.abs() + a.expanded_mm()).total_cmp(&(b.step_mm.abs() + b.expanded_mm())));
-            return (most.copied(), 0.0);
+            let most = |e: &Edge| e.step_mm.abs() + e.expanded_mm();
+            return gaps
+                .filter_map(|half| read([middle - half, middle + half]))
+                .max_by(|a, b| most(&a.0).total_cmp(&most(&b.0)));
         }
-        (read([toes[0].at, toes[1].at]), height)
+        read([toes[0].at, toes[1].at])
     }
 
     /// Height of a cap over the chord between its toes; negative for a hollow one.
@@ -225,6 +239,23 @@ impl View<'_> {
         let (from, to) = (profile.boundary(toes[0]), profile.boundary(toes[1]));
         let over = doubts::over_chord(profile, from, to).unwrap_or_default();
         over.into_iter().fold(0.0, |most: f64, h| if h.abs() > most.abs() { h } else { most })
+    }
+
+    /// What a bevel could do where this view hides a toe behind its cap, both sides: nothing says whether metal or wall
+    /// runs there. Bevels are turned, so that one is seen where half of the stations see it.
+    fn hidden(&self, stations: &[Station]) -> f64 {
+        let longest = |k: usize, station: &Station, side: usize| {
+            let toe = station.toes_mm?[side];
+            let (profile, toe) = (&self.smooth[k][side], if side == 0 { -toe } else { toe });
+            let about = profile.boundary(toe - HIDDEN_ABOUT_MM[0])..profile.boundary(toe + HIDDEN_ABOUT_MM[1]);
+            let empty = profile.heights[about].chunk_by(|a, b| a.is_nan() == b.is_nan()).filter(|run| run[0].is_nan());
+            Some(profile.bin * empty.map(<[f64]>::len).max().unwrap_or(0) as f64)
+        };
+        let usual = |side: usize| {
+            let mut all: Vec<f64> = stations.iter().enumerate().filter_map(|(k, s)| longest(k, s, side)).collect();
+            if all.is_empty() { 0.0 } else { median(&mut all) }
+        };
+        (0..2).map(|side| STEEPEST_BEVEL * (usual(side) - HIDDEN_MM).max(0.0)).sum()
     }
 
     /// Where a flank flattens outward, metal that looks like the foot of the cap may be the wall's own edge (an end that
@@ -240,6 +271,19 @@ impl View<'_> {
             })
             .sum()
     }
+}
+
+/// What a bevel shorter than the strip that is not read changes at a toe: the median of neighbours, where it is more than
+/// noise and the flank's light.
+fn bevel(near: &[Bevels], side: usize) -> f64 {
+    let lines: Vec<[f64; 2]> = near.iter().filter_map(|b| b[side]).collect();
+    if lines.len() <= NEIGHBOURS {
+        return 0.0;
+    }
+    let off = median(&mut lines.iter().map(|l| l[0]).collect::<Vec<_>>()).abs();
+    let noise = median(&mut lines.iter().map(|l| l[1]).collect::<Vec<_>>());
+    let seen = edges::FLANK_LIGHT_MM + 3.0 * MEDIAN_EFFICIENCY * noise / (lines.len() as f64).sqrt();
+    if off > seen { off } else { 0.0 }
 }
 
 /// The flank's slope is that of windows of a millimetre.

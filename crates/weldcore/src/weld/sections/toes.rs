@@ -39,9 +39,12 @@ pub(super) fn toe(profile: &Profile, begin: usize, end: usize, sigma: f64, band:
             let model = if i < best { inside.at(profile.x(i)) } else { beside.at(profile.x(i)) };
             (profile.heights[i] - model).abs()
         };
-        let mut sizes: Vec<f64> = (from..to).map(off).filter(|d| d.is_finite()).collect();
-        let limit = CLIP_MADS * (1.4826 * crate::ground::robust::median(&mut sizes)).max(sigma);
-        profile.keeping(|i| i < from || i >= to || off(i) <= limit)
+        // Each by its own: a flank is less of a parabola than a wall, and must not go for it.
+        let [flank, wall] = [from..best, best..to].map(|bins| {
+            let mut sizes: Vec<f64> = bins.map(off).filter(|d| d.is_finite()).collect();
+            CLIP_MADS * (1.4826 * crate::ground::robust::median(&mut sizes)).max(sigma)
+        });
+        profile.keeping(|i| i < from || i >= to || off(i) <= if i < best { flank } else { wall })
     };
     let (best, range) = search(&kept, from, to, sigma, band)?;
     let mut at = kept.edge(best);
@@ -99,4 +102,23 @@ fn search(profile: &Profile, from: usize, to: usize, sigma: f64, band: Option<[f
     let plausible = costs.iter().filter(|c| c.1 <= least + PLAUSIBLE * variance).map(|c| profile.edge(c.0));
     let range = plausible.fold([f64::INFINITY, f64::NEG_INFINITY], |r, x| [r[0].min(x), r[1].max(x)]);
     Some((best, range))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_steep_flank_beside_a_quiet_wall_keeps_its_toe() {
+        // A crown of a power 2.4 that comes down within five bins: no parabola, beside a wall that scatters by micrometres.
+        let height = |x: f64| {
+            let s = ((x - 0.8) / if x < 0.8 { 4.0 } else { 2.2 }).abs();
+            if s < 1.0 { 1.05 * (1.0 - s.powf(2.4)) } else { 0.0 }
+        };
+        let scatter = |i: usize| 0.003 * (((i * 7919) % 13) as f64 / 6.0 - 1.0);
+        let heights = (0..160).map(|i| height(-19.875 + 0.25 * i as f64) + scatter(i)).collect();
+        let profile = Profile::new(-20.0, 0.25, heights);
+        let found = toe(&profile, profile.boundary(-3.2), profile.boundary(3.6), 0.003, None).unwrap();
+        assert!((found.at - 3.0).abs() < 0.3 && found.to < 3.6, "{found:?}");
+    }
 }

@@ -402,6 +402,13 @@ def test_the_step_of_plates_is_their_offset_and_tilt_does_not_change_it():
     assert {REFERENCE_WALL, OTHER_WALL, BEAD} <= set(np.unique(shot.labels).tolist())
 
 
+def test_a_session_of_plates_is_refused_in_one_line(tmp_path):
+    with pytest.raises(InputError, match="a plate cannot be measured yet") as refused:
+        simulate_session(tmp_path / "plates", replace(SMALL, weld=plates(0.5)))
+    assert "\n" not in str(refused.value)
+    assert not (tmp_path / "plates").exists()
+
+
 def test_a_pipe_without_a_weld_shows_none():
     cell = replace(SMALL, weld=pipe(offset_mm=0.0, bead=NO_BEAD, waviness_mm=0.0))
     shot = render(cell, "part", cell.part_views()[0])

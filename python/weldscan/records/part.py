@@ -5,15 +5,21 @@ from __future__ import annotations
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from weldscan.records.fields import PARALLEL_SINE, Direction, Model, Positive
+
+
+def _measured_yet(kind: object) -> object:
+    if kind in ("plate", "shell"):
+        raise ValueError(f"a {kind} cannot be measured yet, only the girth weld of a pipe ('pipe')")
+    return kind
 
 
 class PartSpec(Model):
     """The welded part, as the drawing has it. Directions are in base, or in the scanner's frame without a robot."""
 
-    kind: Literal["pipe"]
+    kind: Annotated[Literal["pipe"], BeforeValidator(_measured_yet)]
     outside_diameter: Positive
     wall_thickness: Positive
     joint: Annotated[str, Field(min_length=1, max_length=100)]

@@ -226,11 +226,25 @@ impl View<'_> {
             let gaps = std::iter::once(0.5 * FLUSH_GAP_MM)
                 .chain(FLUSH_GAPS.iter().map(|g| 0.5 * FLUSH_GAP_MM + g * self.widest_mm));
             let most = |e: &Edge| e.step_mm.abs() + e.expanded_mm();
-            return gaps
-                .filter_map(|half| read([middle - half, middle + half]))
-                .max_by(|a, b| most(&a.0).total_cmp(&most(&b.0)));
+            let read = gaps.filter_map(|half| read([middle - half, middle + half]));
+            let (mut edge, bevels) = read.max_by(|a, b| most(&a.0).total_cmp(&most(&b.0)))?;
+            // Nor which of the surfaces in its reach are the edges: the furthest apart of them may be.
+            let apart = self.spread(k, middle, slope) - edge.step_mm.abs();
+            edge.hull_mm = if apart > walls::TOLERANCE_MM + 3.0 * self.sigma { apart } else { 0.0 };
+            return Some((edge, bevels));
         }
         read([toes[0].at, toes[1].at])
+    }
+
+    /// How far the surface rises and falls where a flush weld may be, over a line of this slope, in blocks of a millimetre.
+    fn spread(&self, k: usize, middle: f64, slope: f64) -> f64 {
+        let (profile, reach) = (self.profile(k), 0.5 * FLUSH_GAP_MM + FLUSH_GAPS[1] * self.widest_mm);
+        let (from, to) = (profile.boundary(middle - reach), profile.boundary(middle + reach));
+        let block = profile.in_bins(1.0);
+        let means = (from..to).step_by(block).filter_map(|at| profile.mean(at, (at + block).min(to)));
+        let heights = means.map(|(x, h)| h - slope * (x - middle));
+        let (low, high) = heights.fold((f64::INFINITY, f64::NEG_INFINITY), |r, h| (r.0.min(h), r.1.max(h)));
+        (high - low).max(0.0)
     }
 
     /// Height of a cap over the chord between its toes; negative for a hollow one.

@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldscan._weldcore import Lens, Scanner
-from weldscan.calibration.bundle import K3, PARAMETERS, BundleModel, Features, prior_sigmas, rotation, rows_of
+from weldscan.calibration.bundle import K3, PARAMETERS, BundleModel, Features, prior_sigmas, rows_of
 from weldscan.calibration.volume import point_jacobian
+from weldscan.geometry import rotation_of
 from weldscan.measure.part_views import PartView
 from weldscan.records.scanner import ScannerSpec
 from weldscan.result import Finding, Label, bar
@@ -245,7 +246,7 @@ def nominal_covariance(scanner: Scanner, distance_mm: float) -> Floats:
     grid = np.meshgrid(*(np.linspace(-1, 1, n) * (1 - 1 / n) for n in CORNERS), indexing="ij")
     corners[:, long], corners[:, short] = grid[0].ravel() * half[long], grid[1].ravel() * half[short]
     tilts = [(near, tilt) for near in DEPTHS for tilt in TILTS_DEG]
-    turns = np.array([rotation(np.radians([*tilt, 0.0])) for _, tilt in tilts])
+    turns = np.array([rotation_of(np.radians([*tilt, 0.0])) for _, tilt in tilts])
     # Nearer boards are moved along the ray to the field's middle.
     shifts = np.array([near * np.array([*middle, distance_mm]) for near, _ in tilts])
     model, count = model_of(scanner, turns, shifts), len(corners)

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from weldscan._weldcore import measure_step
 from weldscan.calibration.hand_eye import LARGEST_RESIDUAL_MM, pose_sigma
-from weldscan.calibration.hand_eye_model import skew
 from weldscan.errors import GeometryError
+from weldscan.geometry import skew
 from weldscan.measure.part_views import PartView
 from weldscan.measure.seam_coverage import BIN_DEG, BINS, edge_profile
 from weldscan.result import Finding, HandEye, Label, PartCloud, Severity, ShotAgreement, bar, warning

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import Lens, Scanner
+from weldscan._weldcore import Lens, Scanner, whitened
 from weldscan.calibration.bundle import K3, PARAMETERS, BundleModel, Features, prior_sigmas, rows_of
 from weldscan.calibration.volume import point_jacobian
 from weldscan.geometry import rotation_of
@@ -75,6 +75,11 @@ class Unevenness:
     around_mm: float
     """Where its correlation ends, around and along the axis."""
     along_mm: float
+
+    def correlation(self, noise_mm2: float) -> tuple[tuple[float, float], float]:
+        """Supports around and along, mm, and the nugget that noise of this variance adds, in units of the variance."""
+        support = max(self.around_mm, 1e-9), max(self.along_mm, 1e-9)
+        return support, noise_mm2 / max(self.rms_mm, 1e-9) ** 2 + LEAST_NUGGET
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,8 +346,8 @@ def step_jacobians(
             drawn = _shell(along, shot.radius_mm, wall_mm)[:, None]
             columns = [cylinder, is_other * cylinder, (1 - is_other) * drawn, is_other * drawn, moved]
             noise = shot.noise_mm**2 * len(at) / len(wall)
-            root = _root(angle * shot.radius_mm, along, unevenness, noise)
-            white.append(np.linalg.solve(root, np.concatenate(columns, axis=1)))
+            places = np.stack([angle * shot.radius_mm, along], axis=1)
+            white.append(whitened(places, np.concatenate(columns, axis=1), *unevenness.correlation(noise)))
         both = np.concatenate(white)
         # The shot's own reference cylinder takes up what it can.
         q, _ = np.linalg.qr(both[:, :5])
@@ -370,18 +375,3 @@ def _shell(along_mm: Floats, radius_mm: float, wall_mm: float) -> Floats:
     """Bending of a shell that a ring draws in, 1 at the ring: `shell_term` of the core's walls (S. Timoshenko)."""
     x = 1.285 * np.abs(along_mm) / math.sqrt(radius_mm * wall_mm)
     return np.asarray(np.exp(-x) * (np.cos(x) + np.sin(x)))
-
-
-def _root(around_mm: Floats, along_mm: Floats, unevenness: Unevenness, noise_mm2: float) -> Floats:
-    """Cholesky factor of the covariance of a wall's points, in units of the unevenness.
-
-    It is the `Covariance` of `weld/step/unevenness.rs`.
-    """
-    r = np.hypot(
-        (around_mm[:, None] - around_mm) / max(unevenness.around_mm, 1e-9),
-        (along_mm[:, None] - along_mm) / max(unevenness.along_mm, 1e-9),
-    )
-    near = np.maximum(1 - r, 0.0)
-    covariance = near**4 * (4 * r + 1)
-    nugget = noise_mm2 / max(unevenness.rms_mm, 1e-9) ** 2
-    return np.asarray(np.linalg.cholesky(covariance + (nugget + LEAST_NUGGET) * np.eye(len(r))))

@@ -93,6 +93,8 @@ pub fn quality<T: Level>(shot: &Shot<'_, T>, finest: Range<usize>, least_modulat
 
 #[cfg(test)]
 mod tests {
+    use std::slice::from_ref;
+
     use super::*;
 
     /// Four steps after two other frames; the left half as bright as `left`, the right half as `right`; modulated by half.
@@ -123,8 +125,8 @@ mod tests {
     #[test]
     fn each_pixel_counts_by_its_best_exposure() {
         let (long, short) = (frames(900.0, 160.0), frames(160.0, 10.0));
-        assert_eq!(judged(&[long.clone()], 0.1).usable, 0.5);
-        assert_eq!(judged(&[short.clone()], 0.1).usable, 0.5);
+        assert_eq!(judged(from_ref(&long), 0.1).usable, 0.5);
+        assert_eq!(judged(from_ref(&short), 0.1).usable, 0.5);
         assert_eq!(judged(&[short, long], 0.1).usable, 1.0);
     }
 

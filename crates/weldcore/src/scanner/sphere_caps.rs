@@ -47,14 +47,11 @@ fn cap(camera: &Lens, centres: &[Vec3], which: usize, radius: f64) -> SphereCap 
         for column in columns.clone() {
             let Some((x, y)) = camera.undistort(column as f64, row as f64) else { continue };
             let ray = Vec3::new(x, y, 1.0).normalize();
-            let Some(depth) = first_hit(&ray, &centre, radius) else { continue };
-            let outward = (ray * depth - centre) / radius;
-            if !(outward.dot(&sight) >= CAP_COS) {
-                continue;
-            }
+            let met = first_hit(&ray, &centre, radius).map(|depth| (depth, (ray * depth - centre) / radius));
+            let Some((depth, outward)) = met.filter(|(_, outward)| outward.dot(&sight) >= CAP_COS) else { continue };
             part.whole += 1;
             let before = |(k, other): (usize, &Vec3)| {
-                k != which && first_hit(&ray, other, radius).is_some_and(|nearer| !(nearer > depth))
+                k != which && first_hit(&ray, other, radius).is_some_and(|nearer| nearer <= depth)
             };
             let inside = (0..camera.width as i64).contains(&column) && (0..camera.height as i64).contains(&row);
             if inside && !centres.iter().enumerate().any(before) {

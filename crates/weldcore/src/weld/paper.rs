@@ -167,8 +167,11 @@ fn without_weld(mut part: Vec<usize>, excess: &[f64]) -> Result<Vec<usize>> {
     Ok(part)
 }
 
+/// Points and their unit normals.
+type Oriented = (Vec<[f64; 3]>, Vec<[f64; 3]>);
+
 /// Step 3: the pipe's surface as a cloud with outward normals, over the arcs and the length that were scanned.
-fn modelled_pipe(points: &[[f64; 3]], pipe: &Pipe) -> Result<(Vec<[f64; 3]>, Vec<[f64; 3]>)> {
+fn modelled_pipe(points: &[[f64; 3]], pipe: &Pipe) -> Result<Oriented> {
     let across = pipe.axis.cross(&Vec3::ith(pipe.axis.abs().imin(), 1.0)).normalize();
     let square = pipe.axis.cross(&across);
     let step = MODEL_SPACING_MM / pipe.radius_mm;
@@ -190,7 +193,8 @@ fn modelled_pipe(points: &[[f64; 3]], pipe: &Pipe) -> Result<(Vec<[f64; 3]>, Vec
     };
     let turns: BTreeSet<i64> = parts.iter().flat_map(|p| &p.2).flat_map(with_margin).collect();
     let length = (high - low) / MODEL_SPACING_MM + 2.0 * MARGIN as f64;
-    if !(length * turns.len() as f64 <= MODEL_POINTS) {
+    let size = length * turns.len() as f64;
+    if size.is_nan() || size > MODEL_POINTS {
         let reach = if high - low < 1e4 { format!("{:.0}", high - low) } else { format!("{:.3e}", high - low) };
         let reason = format!("the points reach over {reach} mm of the pipe: no modelled pipe is so long");
         return Err(Error::NoAnswer { reason });

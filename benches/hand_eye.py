@@ -21,7 +21,8 @@ import numpy as np
 from weldscan import register_rigid, solve_hand_eye
 from weldscan.calibration.artefact import PlateView
 from weldscan.calibration.hand_eye import point_covariance
-from weldscan.calibration.hand_eye_model import FACTORS, Linear, Noise, skew
+from weldscan.calibration.hand_eye_model import FACTORS, Linear, Noise
+from weldscan.geometry import skew
 from weldscan.simulated import DEFAULT, placed, tilted_views
 
 TRUE = np.asarray(DEFAULT.flange_from_scanner)

@@ -23,10 +23,10 @@ LONG = 600
 # What keeps numerics in Python, by room (docs/decisions): what touches every shot may stay, every point may not.
 KEPT_BY = {
     "calibration": "0009, 0012: tens of unknowns, hundreds of rows",
-    "measure": "per shot and bin; agreement's cells and the paper's chain touch every point",
-    "verification": "per sphere and plane",
-    "simulated": "scenes are set up here, rendered in the core",
-    "report": "pictures",
+    "measure": "0020: per shot and bin",
+    "verification": "0020: per sphere, plane and probed point",
+    "simulated": "0020: scenes are set up here, rendered in the core",
+    "report": "0020: pictures",
 }
 TYPE = re.compile(r"^\s*(?:pub(?:\([a-z]+\))? )?(?:struct|enum|trait) ([A-Z]\w+)", re.M)
 

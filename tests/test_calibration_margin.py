@@ -10,7 +10,8 @@ import pytest
 
 from weldscan import Lens, Scanner
 from weldscan._weldcore import triangulate
-from weldscan.calibration.bundle import K3, PARAMETERS, rotation
+from weldscan.calibration.bundle import K3, PARAMETERS
+from weldscan.geometry import rotation_of
 from weldscan.measure.calibration_margin import (
     NOISE_PX,
     CalibrationMargin,
@@ -68,7 +69,7 @@ def moved(scanner: Scanner, by: np.ndarray) -> Scanner:
         return Lens(given.width, given.height, k, np.array([*given.dist, 0.0][:5]) + d[4:])
 
     relation = scanner.camera_from_projector.copy()
-    relation[:3, :3] = rotation(by[18:21]) @ relation[:3, :3]
+    relation[:3, :3] = rotation_of(by[18:21]) @ relation[:3, :3]
     relation[:3, 3] += by[21:24]
     return Scanner(lens(scanner.camera, by[:9]), lens(scanner.projector, by[9:18]), relation)
 
@@ -125,7 +126,7 @@ def test_nearly_parallel_axes_meet_at_no_working_distance():
     lens = Lens(640, 480, [[1000.0, 0, 319.5], [0, 1000.0, 239.5], [0, 0, 1]], [0.0] * 5)
     for turn_rad in (0.0, -0.01):
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation(np.array([0.0, turn_rad, 0.0])), (150.0, 0, 0)
+        pose[:3, :3], pose[:3, 3] = rotation_of(np.array([0.0, turn_rad, 0.0])), (150.0, 0, 0)
         assert working_distance_mm(Scanner(lens, lens, pose), 400.0) == 400.0
 
 

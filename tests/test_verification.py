@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from conftest import shared
 from test_simulate import small_scanner
 from weldscan import GeometryError, InputError, Verdict, inspect
+from weldscan._weldcore import sphere_caps
 from weldscan.measure.scanner_standing import scanner_id, standing_of
 from weldscan.records.history import append_history, check_history, read_history
 from weldscan.records.session import read_session
@@ -36,7 +37,6 @@ from weldscan.verification import (
     verify,
 )
 from weldscan.verification.history import slope, with_drift
-from weldscan.verification.standards import caps
 
 # Sums of some thousand coordinates of 500 mm in double precision.
 ROUNDING_MM = 1e-9
@@ -154,7 +154,7 @@ def test_the_pixels_that_see_a_cap():
     # Behind the first one, and half of it beyond the left edge of the image.
     behind = np.array([10.0, 0.0, 460.0])
     edge = np.array([(-0.5 - lens.K[0, 2]) / lens.K[0, 0] * 400, 0.0, 400.0])
-    (whole, hidden, cut) = caps(lens, np.array([middle, behind, edge]), 10.0)
+    (whole, hidden, cut) = sphere_caps(lens, np.array([middle, behind, edge]), 10.0)
     pixels, outward, all_of_it = whole
     assert len(pixels) == all_of_it and np.all(np.diff(pixels) > 0)
     # Orthographic area of the cap: pi (R sin 60)^2, in pixels of z/f; seen in perspective a little more.

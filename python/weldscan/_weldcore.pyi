@@ -34,6 +34,7 @@ __all__ = [
     "_put_together",
     "_take_apart",
     "calibrate_reference_plane",
+    "capture_quality",
     "decode",
     "decode_gray",
     "decode_phase",
@@ -48,8 +49,10 @@ __all__ = [
     "harmonics_of_gamma",
     "height_from_reference",
     "measure_step",
+    "misalignment",
     "phase_error_of_harmonics",
     "place_shots",
+    "quadric_distances",
     "refuse_masked",
     "register_icp",
     "register_rigid",
@@ -59,10 +62,14 @@ __all__ = [
     "set_threads",
     "simulate_shot",
     "simulated_step",
+    "sphere_caps",
     "sphere_through_points",
     "triangulate",
     "unwrap_spatial",
     "unwrap_temporal",
+    "wall_differences",
+    "wall_seen",
+    "whitened",
 ]
 
 __version__: str
@@ -158,6 +165,9 @@ def decode(
     z: float = 5.0,
     phase_error: Literal["auto"] | Sequence[Sequence[float] | None] | None = None,
 ) -> PhaseMap: ...
+def capture_quality(
+    exposures: Sequence[Sequence[NDArray[Any]]], first: int, steps: int, least_modulation: float
+) -> tuple[float, float, float, float]: ...
 def saturation_level(images: Sequence[NDArray[Any]] | NDArray[Any]) -> tuple[float, float, bool]: ...
 
 # response
@@ -235,6 +245,9 @@ def height_from_reference(
     calibration: ReferencePlane | None = None,
 ) -> NDArray[np.float64]: ...
 def triangulate(column: ArrayLike, scanner: Scanner, sigma_px: ArrayLike | None = None, axis: str = "x") -> Cloud: ...
+def sphere_caps(
+    lens: Lens, centres_mm: ArrayLike, radius_mm: float
+) -> list[tuple[NDArray[np.int64], NDArray[np.float64], int]]: ...
 
 # kdtree
 @final
@@ -249,6 +262,10 @@ class KdTree:
 class Follower:
     def __new__(cls, tree: KdTree) -> Follower: ...
     def nearest(self, queries: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.uint32]]: ...
+
+def quadric_distances(
+    cloud: ArrayLike, points: ArrayLike, patches: Sequence[NDArray[np.uint32]], radius_mm: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]: ...
 
 # transform
 @final
@@ -362,6 +379,7 @@ def fit_sphere(
     points: ArrayLike,
     radius_mm: float | None = None,
     *,
+    near: Sphere | SphereFit | FoundSphere | None = None,
     weights: ArrayLike | None = None,
     sigma_mm: float | None = None,
     robust: bool = False,
@@ -540,6 +558,21 @@ def segment_weld(
     zero: Sequence[float] | None = None,
 ) -> WeldShot: ...
 def measure_step(shots: Sequence[WeldShot], angle_sigma_rad: float = 0.0) -> dict[str, Any]: ...
+def wall_differences(
+    points_mm: ArrayLike,
+    labels: NDArray[np.uint8],
+    shots: NDArray[np.uint16],
+    numbers: Sequence[int],
+    origin_mm: ArrayLike,
+    axis: ArrayLike,
+) -> list[tuple[int, int, int, float, float, float, NDArray[np.float64]]]: ...
+def wall_seen(shot: WeldShot) -> tuple[float, float, float, float] | None: ...
+def misalignment(
+    points_mm: ArrayLike, axis_point_mm: ArrayLike, axis: ArrayLike, radius_mm: float
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_], float]: ...
+def whitened(
+    places_mm: ArrayLike, columns: ArrayLike, support_mm: tuple[float, float], nugget: float
+) -> NDArray[np.float64]: ...
 def place_shots(
     shots: Sequence[tuple[WeldShot, NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], int]],
 ) -> tuple[

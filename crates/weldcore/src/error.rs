@@ -56,6 +56,12 @@ pub enum Error {
         /// What it is, and what it should be; the file's name goes before it.
         reason: String,
     },
+    /// A method gives no answer on these data.
+    #[error("{reason}")]
+    NoAnswer {
+        /// Why.
+        reason: String,
+    },
     /// What was looked for is not in the data.
     #[error("{what} not found: {reason}")]
     NotFound {

@@ -17,11 +17,11 @@
 //! | module | what is in it |
 //! |---|---|
 //! | [`ground`] | [`threads`](ground::threads) whose number changes no bit, [`stop`](ground::stop)ping a long call, [`memory`](ground::memory), [`image`](ground::image)s, [`transform`](ground::transform)s, [`robust`](ground::robust) statistics |
-//! | [`fringes`] | fringe images to wrapped and absolute phase: [`decode_shot`](fringes::decode_shot), [`decode_phase`](fringes::decode_phase), [`unwrap_temporal`](fringes::unwrap_temporal), [`unwrap_spatial`](fringes::unwrap_spatial), [`decode_gray`](fringes::decode_gray) |
+//! | [`fringes`] | fringe images to wrapped and absolute phase: [`decode_shot`](fringes::decode_shot), [`decode_phase`](fringes::decode_phase), [`unwrap_temporal`](fringes::unwrap_temporal), [`unwrap_spatial`](fringes::unwrap_spatial), [`decode_gray`](fringes::decode_gray), the [`quality`](fringes::quality()) of captures |
 //! | [`surfaces`] | [`plane`](surfaces::plane), [`sphere`](surfaces::sphere), [`cylinder`](surfaces::cylinder): distance, foot, fit by orthogonal distance with covariance, [`robust`](surfaces::robust) fits; [`find_spheres`](surfaces::find_spheres) in a cloud |
-//! | [`scanner`] | camera and projector with their [`lens`](scanner::lens)es; phase to points ([`triangulate`](scanner::triangulate)); the [`reference_plane`](scanner::reference_plane) model of the paper |
-//! | [`clouds`] | exact nearest neighbours ([`kdtree`](clouds::kdtree)), [`normals`](clouds::normals), triangle [`mesh`](clouds::mesh)es, signed [`distance`](clouds::distance), iterative closest point ([`icp`](clouds::icp)) |
-//! | [`weld`] | [`segment`](weld::segment): walls and cap of a shot; [`sections`](weld::sections): toes and doubts, station by station; [`step`](weld::step) around the seam and its uncertainty; [`place`](weld::place): the shots of a part in base; [`seam_fates`](weld::seam_fates): what became of every pixel |
+//! | [`scanner`] | camera and projector with their [`lens`](scanner::lens)es; phase to points ([`triangulate`](scanner::triangulate)); the pixels of [`sphere_caps`](scanner::sphere_caps); the [`reference_plane`](scanner::reference_plane) model of the paper |
+//! | [`clouds`] | exact nearest neighbours ([`kdtree`](clouds::kdtree)), [`normals`](clouds::normals), triangle [`mesh`](clouds::mesh)es, signed [`distance`](clouds::distance), [`quadric`](clouds::quadric)s through patches, iterative closest point ([`icp`](clouds::icp)) |
+//! | [`weld`] | [`segment`](weld::segment): walls and cap of a shot; [`sections`](weld::sections): toes and doubts, station by station; [`step`](weld::step) around the seam and its uncertainty; [`place`](weld::place): the shots of a part in base; [`agreement`](weld::agreement) of shots; [`paper`](weld::paper): the paper's own method; [`seam_fates`](weld::seam_fates): what became of every pixel |
 //! | [`simulate`] | ray-cast fringe images of analytic scenes and welds, with the truth |
 
 pub mod clouds;

@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldscan.errors import GeometryError
+from weldscan.geometry import rigid, rotation_of, skew
 
 Floats = NDArray[np.float64]
 
@@ -123,9 +124,9 @@ class BundleModel:
         return BundleModel(
             self.camera + step[CAMERA],
             self.projector + step[PROJECTOR],
-            rotation(step[18:21]) @ self.turn,
+            rotation_of(step[18:21]) @ self.turn,
             self.shift + step[21:24],
-            np.array([rotation(d[:3]) @ r for d, r in zip(pose_steps, self.turns, strict=True)]),
+            np.array([rotation_of(d[:3]) @ r for d, r in zip(pose_steps, self.turns, strict=True)]),
             self.shifts + pose_steps[:, 3:],
             self.shape,
         )
@@ -198,26 +199,6 @@ def project(lens: Floats, points: Floats) -> tuple[Floats, Floats, Floats]:
     by_point[:, 0, 2] = -(xx * x + xy * y) * inverse
     by_point[:, 1, 2] = -(yx * x + yy * y) * inverse
     return np.stack([fx * xd + cx, fy * yd + cy], axis=1), by_lens, by_point
-
-
-def skew(v: Floats) -> Floats:
-    """(n, 3, 3), of v x."""
-    out = np.zeros((*v.shape[:-1], 3, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    return np.asarray(out - np.swapaxes(out, -1, -2))
-
-
-def rotation(w: Floats) -> Floats:
-    """Rodrigues."""
-    matrix: Floats = np.asarray(cv2.Rodrigues(np.asarray(w, dtype=np.float64).reshape(3, 1))[0], dtype=np.float64)
-    return matrix
-
-
-def rigid(turn: Floats, shift: Floats) -> Floats:
-    """4x4."""
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = turn, shift
-    return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,9 +39,9 @@ from weldscan.calibration.hand_eye_model import (
     Posterior,
     chi2_quantile,
     f_exceeded,
-    skew,
 )
 from weldscan.errors import GeometryError, InputError
+from weldscan.geometry import inverse, rotation_of, rotation_vector_of, skew
 from weldscan.result import ArtefactShot, ArtefactSphere, HandEye
 
 Floats = NDArray[np.float64]
@@ -73,23 +73,6 @@ LEAST_TILT_RAD = math.radians(10)
 MAX_ITERATIONS = 30
 # A cause that leaves more than this part of the squares is none: honest touches leave a tenth of what calls for a word.
 UNEXPLAINED = 0.25
-
-
-def rotation_of(w: Floats) -> Floats:
-    """The rotation by a vector's length about its direction (Rodrigues)."""
-    angle = float(np.linalg.norm(w))
-    if angle < 1e-12:
-        return np.eye(3) + skew(w)
-    k = skew(w / angle)
-    return np.asarray(np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k)
-
-
-def inverse(t: Floats) -> Floats:
-    """Of a rigid transform."""
-    out = np.eye(4)
-    out[:3, :3] = t[:3, :3].T
-    out[:3, 3] = -t[:3, :3].T @ t[:3, 3]
-    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,12 +301,8 @@ def tilts_rad(base_from_flange: Sequence[Floats]) -> tuple[float, float]:
     vectors = []
     for i, one in enumerate(turns):
         for other in turns[:i]:
-            turn = one.T @ other
-            axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-            sine = float(np.linalg.norm(axis)) / 2
-            angle = math.atan2(sine, (float(np.trace(turn)) - 1) / 2)
             # Half a turn has no axis here; it is a large turn all the same, and others tell about which axis.
-            vectors.append(axis / (2 * sine) * angle if sine > 1e-9 else np.zeros(3))
+            vectors.append(rotation_vector_of(one.T @ other))
     if not vectors:
         return 0.0, 0.0
     spread = np.linalg.svd(np.array(vectors), compute_uv=False) / math.sqrt(len(vectors))

@@ -25,6 +25,8 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
+from weldscan.geometry import skew
+
 Floats = NDArray[np.float64]
 
 # The factors: sphere fits, the pose's place, the pose's direction, each touch's own error, the bias that all share.
@@ -70,13 +72,6 @@ class Posterior:
     """(5,) variances over the stated ones, posterior means."""
     mode: Floats
     """(5,) the factors where the posterior is highest."""
-
-
-def skew(v: Floats) -> Floats:
-    """(..., 3, 3) matrices of the cross product."""
-    out = np.zeros((*v.shape[:-1], 3, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    return out - np.swapaxes(out, -1, -2)
 
 
 class Linear:

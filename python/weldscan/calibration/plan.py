@@ -24,11 +24,11 @@ from weldscan.calibration.hand_eye import (
     POSE_SIGMA_MM,
     POSE_SIGMA_RAD,
     TOUCH_BIAS_SIGMA_MM,
-    inverse,
     tilts_rad,
 )
-from weldscan.calibration.hand_eye_model import FACTORS, UNKNOWNS, Linear, Noise, skew
+from weldscan.calibration.hand_eye_model import FACTORS, UNKNOWNS, Linear, Noise
 from weldscan.errors import InputError
+from weldscan.geometry import inverse, rotation_angle, skew
 from weldscan.pose import KukaPose, matrix_from_kuka
 from weldscan.records.plan import NAME, PlanSource
 from weldscan.records.session import FlangePose, Session, ShotSpec
@@ -354,10 +354,8 @@ def _short_way(shots: list[PlannedShot]) -> list[PlannedShot]:
 
         def far(i: int, here: Floats = here) -> float:
             there = left[i].base_from_flange
-            cosine = (float(np.trace(here[:3, :3].T @ there[:3, :3])) - 1) / 2
-            return math.hypot(
-                float(np.linalg.norm(here[:3, 3] - there[:3, 3])), 300 * math.acos(min(1.0, max(-1.0, cosine)))
-            )
+            turned = rotation_angle(here[:3, :3].T @ there[:3, :3])
+            return math.hypot(float(np.linalg.norm(here[:3, 3] - there[:3, 3])), 300 * turned)
 
         way.append(left.pop(min(range(len(left)), key=far)))
     return way

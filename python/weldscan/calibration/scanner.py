@@ -25,6 +25,7 @@ from weldscan.calibration import bundle, volume
 from weldscan.calibration.board import LEAST_FEATURES, Board, find_board, handedness, parse_board
 from weldscan.calibration.captures import Stack, phases_at, read_stack, saturated_share
 from weldscan.errors import GeometryError, InputError
+from weldscan.geometry import rigid
 from weldscan.records.capture import MANIFEST, Captures, PoseSpec, read_captures
 from weldscan.result import BoardPose, NextPose, ScannerCalibration, VolumePoint
 
@@ -493,7 +494,7 @@ def _pose(view: BoardView, f: bundle.Features, solved: bundle.Solution, i: int, 
     turn, shift = solved.model.turns[i], solved.model.shifts[i]
     return BoardPose(
         name=view.name,
-        camera_from_board=bundle.rigid(turn, shift),
+        camera_from_board=rigid(turn, shift),
         tilt_deg=math.degrees(math.acos(min(1.0, abs(float(turn[2, 2]))))),
         distance_mm=float(np.linalg.norm(shift)),
         camera_px=f.camera_px[mine],

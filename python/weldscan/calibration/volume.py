@@ -16,11 +16,9 @@ from weldscan.calibration.bundle import (
     Features,
     Solution,
     project,
-    rigid,
-    rotation,
     rows_of,
-    skew,
 )
+from weldscan.geometry import rigid, rotation_of, skew
 
 Floats = NDArray[np.float64]
 
@@ -171,7 +169,7 @@ def best_pose(
         for tilt in TILTS_DEG:
             for around in AROUND_DEG if tilt else (0.0,):
                 lean = math.radians(around)
-                turn = rotation(math.radians(tilt) * np.array([-math.sin(lean), math.cos(lean), 0.0]))
+                turn = rotation_of(math.radians(tilt) * np.array([-math.sin(lean), math.cos(lean), 0.0]))
                 trial = BundleModel(
                     model.camera,
                     model.projector,

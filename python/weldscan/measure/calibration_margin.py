@@ -24,9 +24,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import Lens, Scanner
-from weldscan.calibration.bundle import K3, PARAMETERS, BundleModel, Features, prior_sigmas, rotation, rows_of
+from weldscan._weldcore import Lens, Scanner, whitened
+from weldscan.calibration.bundle import K3, PARAMETERS, BundleModel, Features, prior_sigmas, rows_of
 from weldscan.calibration.volume import point_jacobian
+from weldscan.geometry import rotation_of
 from weldscan.measure.part_views import PartView
 from weldscan.records.scanner import ScannerSpec
 from weldscan.result import Finding, Label, bar
@@ -74,6 +75,11 @@ class Unevenness:
     around_mm: float
     """Where its correlation ends, around and along the axis."""
     along_mm: float
+
+    def correlation(self, noise_mm2: float) -> tuple[tuple[float, float], float]:
+        """Supports around and along, mm, and the nugget that noise of this variance adds, in units of the variance."""
+        support = max(self.around_mm, 1e-9), max(self.along_mm, 1e-9)
+        return support, noise_mm2 / max(self.rms_mm, 1e-9) ** 2 + LEAST_NUGGET
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +251,7 @@ def nominal_covariance(scanner: Scanner, distance_mm: float) -> Floats:
     grid = np.meshgrid(*(np.linspace(-1, 1, n) * (1 - 1 / n) for n in CORNERS), indexing="ij")
     corners[:, long], corners[:, short] = grid[0].ravel() * half[long], grid[1].ravel() * half[short]
     tilts = [(near, tilt) for near in DEPTHS for tilt in TILTS_DEG]
-    turns = np.array([rotation(np.radians([*tilt, 0.0])) for _, tilt in tilts])
+    turns = np.array([rotation_of(np.radians([*tilt, 0.0])) for _, tilt in tilts])
     # Nearer boards are moved along the ray to the field's middle.
     shifts = np.array([near * np.array([*middle, distance_mm]) for near, _ in tilts])
     model, count = model_of(scanner, turns, shifts), len(corners)
@@ -340,8 +346,8 @@ def step_jacobians(
             drawn = _shell(along, shot.radius_mm, wall_mm)[:, None]
             columns = [cylinder, is_other * cylinder, (1 - is_other) * drawn, is_other * drawn, moved]
             noise = shot.noise_mm**2 * len(at) / len(wall)
-            root = _root(angle * shot.radius_mm, along, unevenness, noise)
-            white.append(np.linalg.solve(root, np.concatenate(columns, axis=1)))
+            places = np.stack([angle * shot.radius_mm, along], axis=1)
+            white.append(whitened(places, np.concatenate(columns, axis=1), *unevenness.correlation(noise)))
         both = np.concatenate(white)
         # The shot's own reference cylinder takes up what it can.
         q, _ = np.linalg.qr(both[:, :5])
@@ -369,18 +375,3 @@ def _shell(along_mm: Floats, radius_mm: float, wall_mm: float) -> Floats:
     """Bending of a shell that a ring draws in, 1 at the ring: `shell_term` of the core's walls (S. Timoshenko)."""
     x = 1.285 * np.abs(along_mm) / math.sqrt(radius_mm * wall_mm)
     return np.asarray(np.exp(-x) * (np.cos(x) + np.sin(x)))
-
-
-def _root(around_mm: Floats, along_mm: Floats, unevenness: Unevenness, noise_mm2: float) -> Floats:
-    """Cholesky factor of the covariance of a wall's points, in units of the unevenness.
-
-    It is the `Covariance` of `weld/step/unevenness.rs`.
-    """
-    r = np.hypot(
-        (around_mm[:, None] - around_mm) / max(unevenness.around_mm, 1e-9),
-        (along_mm[:, None] - along_mm) / max(unevenness.along_mm, 1e-9),
-    )
-    near = np.maximum(1 - r, 0.0)
-    covariance = near**4 * (4 * r + 1)
-    nugget = noise_mm2 / max(unevenness.rms_mm, 1e-9) ** 2
-    return np.asarray(np.linalg.cholesky(covariance + (nugget + LEAST_NUGGET) * np.eye(len(r))))

@@ -22,21 +22,16 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import measure_step
+from weldscan._weldcore import measure_step, wall_differences, wall_seen
 from weldscan.calibration.hand_eye import LARGEST_RESIDUAL_MM, pose_sigma
-from weldscan.calibration.hand_eye_model import skew
 from weldscan.errors import GeometryError
+from weldscan.geometry import skew
 from weldscan.measure.part_views import PartView
 from weldscan.measure.seam_coverage import BIN_DEG, BINS, edge_profile
 from weldscan.result import Finding, HandEye, Label, PartCloud, Severity, ShotAgreement, bar, warning
 
 Floats = NDArray[np.float64]
 
-# Cells in which the walls are compared: small against any pipe's radius, and of tens of points.
-CELL_MM = 4.0
-LEAST_POINTS, LEAST_CELLS = 5, 20
-# Points of a shot that are looked at; more would change nothing.
-POINTS = 150_000
 # Neighbouring cells share the scanner's errors: about so many count as one.
 CORRELATED_CELLS = 4
 # Two shots, each placed as wrong as no industrial arm stands.
@@ -46,10 +41,9 @@ LARGEST_DIFFERENCE_MM = 2 * LARGEST_RESIDUAL_MM
 # A wall's own direction, 1 sigma: the weld draws both walls in by 0.2 mm over some 2.5 sqrt(R t), a decimetre (half a
 # millimetre is the most), and a pipe is straight to 0.2 % of its length.
 WALL_LEAN_RAD = math.radians(0.1)
-# Waves of a wall that a fitted cylinder follows: at least what any pipe has, else twice what is left over in a grid of
-# so many cells around and along, for the fit has flattened them.
+# Waves of a wall that a fitted cylinder follows: at least what any pipe has, else twice what is left over, for the fit
+# has flattened them.
 UNEVENNESS_MM, FLATTENED = 0.01, 2.0
-GRID = 10
 # How far a pipe's cut end may be from square (a sixteenth of an inch is the usual tolerance), and how far the middle
 # between two toes may be from it in parts of the cap's width: a cap is as much wider on one side. A toe misread in one
 # shot moves the middle by half of what the widths differ; a cap so wide has a bar of its own.
@@ -100,33 +94,21 @@ def agreement(
         One per pair that saw a wall together in 20 cells of 4 mm or more.
     """
     axis = axis / np.linalg.norm(axis)
-    zero = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
-    zero /= np.linalg.norm(zero)
-    across = np.cross(axis, zero)
-    seen = [_cells(cloud, shot.index, origin_mm, axis, zero, across) for shot in shots]
     found = []
-    for j, other in enumerate(shots):
-        for i, one in enumerate(shots[:j]):
-            common, a, b = np.intersect1d(seen[i][0], seen[j][0], return_indices=True)
-            if len(common) < LEAST_CELLS:
-                continue
-            off = seen[j][1][b] - seen[i][1][a]
-            middle = seen[i][2][a].mean(axis=0)
-            radial = middle - origin_mm - axis * (axis @ (middle - origin_mm))
-            normal = radial / np.linalg.norm(radial)
-            difference = float(np.median(off))
-            scatter = 1.4826 * float(np.median(np.abs(off - difference)))
-            placing = _placing_mm([one, other], hand_eye, middle, normal)
-            u_mm = math.hypot(placing, scatter / math.sqrt(len(common) / CORRELATED_CELLS))
-            found.append(
-                ShotAgreement(
-                    shots=(one.name, other.name),
-                    cells=len(common),
-                    difference_mm=difference,
-                    rms_mm=float(np.sqrt(np.square(off).mean())),
-                    expanded_uncertainty_mm=2 * u_mm,
-                )
+    pairs = wall_differences(cloud.points_mm, cloud.label, cloud.shot, [shot.index for shot in shots], origin_mm, axis)
+    for i, j, cells, difference_mm, scatter_mm, rms_mm, middle in pairs:
+        radial = middle - origin_mm - axis * (axis @ (middle - origin_mm))
+        normal = radial / np.linalg.norm(radial)
+        placing = _placing_mm([shots[i], shots[j]], hand_eye, middle, normal)
+        found.append(
+            ShotAgreement(
+                shots=(shots[i].name, shots[j].name),
+                cells=cells,
+                difference_mm=difference_mm,
+                rms_mm=rms_mm,
+                expanded_uncertainty_mm=2 * math.hypot(placing, scatter_mm / math.sqrt(cells / CORRELATED_CELLS)),
             )
+        )
     return tuple(found)
 
 
@@ -216,48 +198,21 @@ class _Seen:
     def of(cls, view: PartView) -> _Seen:
         shot, turn = view.shot, view.base_from_scanner[:3, :3]
         origin, axis = view.axis_in_base
-        wall = np.flatnonzero(shot.labels == Label.REFERENCE_WALL)
-        wall = wall[:: max(1, len(wall) // 20_000)]
-        angle, along = shot.angle_rad[wall].astype(np.float64), shot.axial_mm[wall].astype(np.float64)
-        middle = math.atan2(float(np.sin(angle).mean()), float(np.cos(angle).mean()))
+        seen = wall_seen(shot)
+        if seen is None:
+            raise GeometryError(f"{view.name}: no point of it lies on the reference wall")
+        middle, half, twist, left = seen
         zero = turn @ shot.zero
         zero = zero - axis * (axis @ zero)
         zero /= np.linalg.norm(zero)
         outward = math.cos(middle) * zero + math.sin(middle) * np.cross(axis, zero)
         across = np.cross(axis, outward)
         # The axis leans towards the view, or turns across it: then the wall is twisted by along * sin(angle) only.
-        twist = float(np.std((along - along.mean()) * np.sin(angle - middle)))
-        towards = WALL_LEAN_RAD
-        waves = _waves_mm(angle - middle, along, shot.deviation_mm[wall].astype(np.float64))
+        waves = max(UNEVENNESS_MM, FLATTENED * left)
         sideways = math.hypot(WALL_LEAN_RAD, waves / max(twist, 1e-3))
-        covariance = towards**2 * np.outer(outward, outward) + sideways**2 * np.outer(across, across)
-        half = float(np.quantile(np.abs(np.angle(np.exp(1j * (angle - middle)))), 0.98))
+        covariance = WALL_LEAN_RAD**2 * np.outer(outward, outward) + sideways**2 * np.outer(across, across)
         centre = waves / max(1 - math.cos(half), 1e-4)
         return cls(view, axis, origin + shot.radius_mm * outward, outward, covariance, centre)
-
-
-def _waves_mm(angle: Floats, along: Floats, deviation: Floats) -> float:
-    """How uneven a wall is beyond what is the same all along it (the pipe's form) or all around it (a drawn-in end)."""
-
-    def cells(values: Floats) -> NDArray[np.intp]:
-        edges = np.quantile(values, np.linspace(0, 1, GRID + 1)[1:-1])
-        return np.searchsorted(edges, values)
-
-    cell = cells(np.angle(np.exp(1j * angle))) * GRID + cells(along)
-    count = np.bincount(cell, minlength=GRID**2)
-    mean = np.bincount(cell, deviation, GRID**2) / np.maximum(count, 1)
-    grid = np.where(count >= LEAST_POINTS, mean, np.nan).reshape(GRID, GRID)
-    grid = grid - _middle(grid, 0)
-    grid = grid - _middle(grid, 1)
-    rms = float(np.sqrt(np.nanmean(np.square(grid)))) if np.isfinite(grid).any() else 0.0
-    return max(UNEVENNESS_MM, FLATTENED * rms)
-
-
-def _middle(grid: Floats, axis: int) -> Floats:
-    """The mean of what there is, kept as a dimension; 0 where there is nothing."""
-    there = np.isfinite(grid)
-    total = np.where(there, grid, 0.0).sum(axis=axis, keepdims=True)
-    return np.asarray(total / np.maximum(there.sum(axis=axis, keepdims=True), 1))
 
 
 def _about_places(views: Sequence[PartView], misplaced: Mapping[tuple[int, int], Sequence[str]]) -> list[Finding]:
@@ -416,36 +371,6 @@ def _unlike(
         else:
             yield warning("agreement", text, other, float(worst))
         return
-
-
-# --- the same wall ----------------------------------------------------------------------------------------------------
-
-
-def _cells(
-    cloud: PartCloud, shot: int, origin: Floats, axis: Floats, zero: Floats, across: Floats
-) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """Of one shot's walls per cell of the unrolled pipe: its number, mean distance from the axis, middle in base."""
-    walls = (cloud.label == Label.REFERENCE_WALL) | (cloud.label == Label.OTHER_WALL)
-    chosen = np.flatnonzero(walls & (cloud.shot == shot))
-    points = cloud.points_mm[chosen[:: max(1, len(chosen) // POINTS)]] - origin
-    x, y, along = points @ zero, points @ across, points @ axis
-    radius = np.hypot(x, y)
-    if len(radius) == 0:
-        return np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3))
-    # A round number of cells around, the same for every shot.
-    around = np.floor((np.arctan2(y, x) / (2 * math.pi) % 1.0) * _cells_around(cloud, origin, axis)).astype(np.int64)
-    key = around * 1_000_003 + np.floor(along / CELL_MM).astype(np.int64)
-    cells, place, count = np.unique(key, return_inverse=True, return_counts=True)
-    mean = np.bincount(place, radius) / count
-    middle = np.stack([np.bincount(place, points[:, k]) / count for k in range(3)], axis=1) + origin
-    good = count >= LEAST_POINTS
-    return cells[good], mean[good], middle[good]
-
-
-def _cells_around(cloud: PartCloud, origin: Floats, axis: Floats) -> int:
-    few = cloud.points_mm[:: max(1, len(cloud.points_mm) // 1000)] - origin
-    radius = float(np.median(np.linalg.norm(few - np.outer(few @ axis, axis), axis=1)))
-    return max(8, round(2 * math.pi * radius / CELL_MM))
 
 
 def _placing_mm(shots: Sequence[PlacedShot], hand_eye: HandEye, point: Floats, normal: Floats) -> float:

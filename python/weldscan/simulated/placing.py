@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldscan._weldcore import Lens, Scanner
+from weldscan.geometry import rigid, rotation_of
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -31,24 +32,11 @@ def look_at(
     return pose
 
 
-def rotation_of(rotation_vector: Sequence[float] | Floats) -> Floats:
-    angle = float(np.linalg.norm(rotation_vector))
-    if angle == 0.0:
-        return np.eye(3)
-    x, y, z = np.asarray(rotation_vector) / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    rotation: Floats = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-    return rotation
-
-
 def placed(
     translation: Sequence[float] | Floats, rotation_vector: Sequence[float] | Floats = (0.0, 0.0, 0.0)
 ) -> Floats:
     """Return the 4x4 transform of a translation (mm) and a rotation vector (rad)."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_of(rotation_vector)
-    pose[:3, 3] = translation
-    return pose
+    return rigid(rotation_of(rotation_vector), translation)
 
 
 def moved(pose: Floats, points: Floats) -> Floats:

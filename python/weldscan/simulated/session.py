@@ -14,11 +14,12 @@ import numpy as np
 
 from weldscan._weldcore import Lens, SimulatedShot, simulate_shot, simulated_step
 from weldscan.errors import InputError
+from weldscan.geometry import rotation_of
 from weldscan.pose import KukaPose
 from weldscan.records.images import Frames
 from weldscan.records.session import Session, write_session
 from weldscan.simulated.cell import DEFAULT, Cell
-from weldscan.simulated.placing import Floats, moved, rotation_of
+from weldscan.simulated.placing import Floats, moved
 
 Progress: TypeAlias = Callable[[int, int, str], None]
 """Called with shots done, shots in all, and what is being done."""

@@ -9,10 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-from weldscan._weldcore import saturation_level
+from weldscan._weldcore import capture_quality, saturation_level
 from weldscan.devices.cameras import Camera, Image
 from weldscan.devices.projectors import Pattern, Projector, whole_refreshes
 
@@ -73,25 +70,5 @@ def judge(stacks: Sequence[Sequence[Image]], fringes: Sets, least_modulation: fl
         least_modulation: in parts of full scale: below it a pixel counts as dark.
     """
     finest = max(range(len(fringes)), key=lambda k: fringes[k][1])
-    start, steps = sum(n for _, _, n in fringes[:finest]), fringes[finest][2]
-    shape = stacks[0][0].shape
-    best: NDArray[np.float32] = np.zeros(shape, np.float32)
-    unsaturated = np.zeros(shape, bool)
-    phase = 2 * np.pi * np.arange(steps) / steps
-    for stack in stacks:
-        level, top, _ = saturation_level(stack)
-        whole = np.maximum.reduce(stack) < level
-        cosine, sine = (
-            np.tensordot(weights.astype(np.float32), np.asarray(stack[start : start + steps], np.float32), 1)
-            for weights in (np.cos(phase), np.sin(phase))
-        )
-        modulation = np.hypot(cosine, sine) * np.float32(2 / steps / top)
-        best = np.where(whole, np.maximum(best, modulation), best)
-        unsaturated |= whole
-    usable = unsaturated & (best >= least_modulation)
-    return Quality(
-        usable=float(usable.mean()),
-        saturated=float((~unsaturated).mean()),
-        dark=float((unsaturated & ~usable).mean()),
-        median_modulation=float(np.median(best[usable])) if usable.any() else 0.0,
-    )
+    first, steps = sum(n for _, _, n in fringes[:finest]), fringes[finest][2]
+    return Quality(*capture_quality(stacks, first, steps, least_modulation))

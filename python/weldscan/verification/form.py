@@ -6,15 +6,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from statistics import NormalDist
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from weldscan._weldcore import fit_plane, fit_sphere, refuse_masked
-from weldscan.errors import GeometryError, InputError
+from weldscan._weldcore import PlaneFit, SphereFit, distance, fit_plane, fit_sphere, refuse_masked
+from weldscan.errors import InputError
 
 Floats = NDArray[np.float64]
+Surface = TypeVar("Surface", SphereFit, PlaneFit)
 
 # A point further from a sphere than this share of its radius does not say where the sphere is: it counts in the range
 # and does not pull the fit. `find_spheres` calls the same the surroundings.
@@ -45,8 +46,8 @@ class FormError:
     """How many lie too far off to say where the surface is; the ranges have them, the fit and the rms do not."""
     residual_mm: Floats = field(repr=False)
     """(n,) of all points."""
-    fit: Floats = field(repr=False)
-    """Centre and radius, or point and normal."""
+    fit: SphereFit | PlaneFit = field(repr=False)
+    """The sphere or plane."""
 
 
 def probing_error(points_mm: ArrayLike, diameter_mm: float, share: float = 1.0) -> FormError:
@@ -83,39 +84,8 @@ def probing_error(points_mm: ArrayLike, diameter_mm: float, share: float = 1.0) 
         raise InputError(f"diameter_mm: must be positive, got {diameter_mm!r}")
 
     start = fit_sphere(points, robust=True)
-    found = _form(
-        points,
-        share,
-        np.array([*start.center_mm, start.radius_mm]),
-        least_squares_sphere,
-        lambda some, sphere: np.linalg.norm(some - sphere[:3], axis=1) - sphere[3],
-        zone_mm=SPHERE_ZONE * float(start.radius_mm),
-    )
-    return FormError(**found, size_mm=2 * float(found["fit"][3]) - diameter_mm)
-
-
-def least_squares_sphere(points_mm: Floats, start: Floats, free: bool = True) -> Floats:
-    """Centre and radius (x, y, z, R), mm, of the least-squares sphere; by Gauss-Newton from a sphere near by.
-
-    `fit_sphere` minimises the same, but begins at the algebraic sphere, which points far off lead astray.
-    """
-    sphere = np.array(start, dtype=float)
-    for _ in range(50):
-        away = points_mm - sphere[:3]
-        distance = np.linalg.norm(away, axis=1)
-        rows = -away / np.maximum(distance, 1e-300)[:, None]
-        if free:
-            rows = np.column_stack([rows, -np.ones(len(rows))])
-        try:
-            step = np.linalg.solve(rows.T @ rows, -rows.T @ (distance - sphere[3]))
-        except np.linalg.LinAlgError:
-            raise GeometryError("the points do not determine a sphere") from None
-        sphere[: len(step)] += step
-        if np.abs(step).max() <= 1e-12 * max(sphere[3], 1.0):
-            break
-    if not np.isfinite(sphere).all() or sphere[3] <= 0:
-        raise GeometryError("the points do not determine a sphere")
-    return sphere
+    found = _form(points, share, start, lambda some, near: fit_sphere(some, near=near), SPHERE_ZONE * start.radius_mm)
+    return FormError(**found, size_mm=2 * float(found["fit"].radius_mm) - diameter_mm)
 
 
 def flatness_error(points_mm: ArrayLike, share: float = 1.0) -> FormError:
@@ -137,21 +107,9 @@ def flatness_error(points_mm: ArrayLike, share: float = 1.0) -> FormError:
         >>> round(flatness_error(np.stack([x, y, 500 + wave], axis=1)).form_mm, 6)
         0.02
     """
-
-    def fitted(some: Floats, _: Floats) -> Floats:
-        fit = fit_plane(some)
-        return np.array([*fit.point_mm, *fit.normal])
-
     points = _points(points_mm)
     start = fit_plane(points[:: max(1, len(points) // PLANE_SAMPLE)], robust=True)
-    found = _form(
-        points,
-        share,
-        np.array([*start.point_mm, *start.normal]),
-        fitted,
-        lambda some, plane: some @ plane[3:] - plane[:3] @ plane[3:],
-        zone_mm=PLANE_ZONE * extent_mm(points),
-    )
+    found = _form(points, share, start, lambda some, _: fit_plane(some), PLANE_ZONE * extent_mm(points))
     return FormError(**found, size_mm=None)
 
 
@@ -171,25 +129,20 @@ def extent_mm(points: Floats) -> float:
 
 
 def _form(
-    points: Floats,
-    share: float,
-    start: Floats,
-    fitted: Callable[[Floats, Floats], Floats],
-    residual_of: Callable[[Floats, Floats], Floats],
-    zone_mm: float,
+    points: Floats, share: float, start: Surface, fitted: Callable[[Floats, Surface], Surface], zone_mm: float
 ) -> dict[str, Any]:
     """The fields of FormError: the surface through the points that are on it, the ranges over all of them."""
     if not 0.95 <= share <= 1:
         raise InputError(f"share: must be between 0.95 and 1, got {share!r}")
-    on_it = np.abs(residual_of(points, start)) <= zone_mm
+    on_it = distance(points, start, signed=False) <= zone_mm
     fit = fitted(points[on_it], start)
-    residual = np.asarray(residual_of(points, fit), dtype=np.float64)
+    residual = distance(points, fit)
     order = np.argsort(np.abs(residual), kind="stable")
-    ranges: dict[float, tuple[float, Floats, int]] = {}
+    ranges: dict[float, tuple[float, Surface, int]] = {}
     for each in {1.0, 0.997, 0.95, share}:
         kept = np.sort(order[: len(points) - math.floor(round((1 - each) * len(points), 6))])
         again = fit if len(kept) == len(points) else fitted(points[kept[on_it[kept]]], fit)
-        ranges[each] = float(np.ptp(residual_of(points[kept], again))), again, len(kept)
+        ranges[each] = float(np.ptp(distance(points[kept], again))), again, len(kept)
     rms = float(np.sqrt(np.square(residual[on_it]).mean()))
     return {
         "form_mm": ranges[share][0],

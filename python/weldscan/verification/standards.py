@@ -9,25 +9,27 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import FoundSphere, Lens, estimate_normals, find_spheres, fit_plane
+from weldscan._weldcore import (
+    FoundSphere,
+    Lens,
+    PlaneFit,
+    distance,
+    estimate_normals,
+    find_spheres,
+    fit_plane,
+    fit_sphere,
+    sphere_caps,
+)
 from weldscan.calibration.artefact import PAIRS, TOUCH_SIGMA_MM, PlateMismatch, distances
 from weldscan.errors import GeometryError, InputError
 from weldscan.records.session import ArtefactSpec, PlaneSpec
 from weldscan.result import BallError, PlaneError, SpacingError
-from weldscan.verification.form import (
-    PLANE_SAMPLE,
-    PLANE_ZONE,
-    extent_mm,
-    flatness_error,
-    least_squares_sphere,
-    probing_error,
-)
+from weldscan.verification.form import PLANE_SAMPLE, PLANE_ZONE, extent_mm, flatness_error, probing_error
 
 Floats = NDArray[np.float64]
 
-# The cone about the line of sight in which a sphere counts, as `find_spheres` has it and ASTM E3125 evaluates scanned
-# spheres: beyond 60 degrees light falls and is seen too obliquely.
-CAP_COS = 0.5
+# Sine of the 60 degrees about the line of sight in which a sphere counts (`sphere_caps`).
+CAP_SIN = math.sqrt(0.75)
 # Half of a cap or plane must have given points: less is another, easier standard than the one that is there.
 LEAST_SEEN = 0.5
 LEAST_POINTS = 100
@@ -49,47 +51,6 @@ MAP_CELLS = 44
 def touched_distance_u_mm(artefact: ArtefactSpec) -> float:
     """Of the distance of two centres that were touched each on its own, k = 2; their common bias cancels."""
     return 2 * math.sqrt(2) * (artefact.touch_sigma_mm or TOUCH_SIGMA_MM)
-
-
-def caps(lens: Lens, centres_mm: Floats, radius_mm: float) -> list[tuple[NDArray[np.intp], Floats, int]]:
-    """Per sphere, the pixels whose rays meet its 120 degree cap before any other sphere, and where they meet it.
-
-    Args:
-        lens: the camera's.
-        centres_mm: (n, 3), scanner frame.
-        radius_mm: of the spheres.
-
-    Returns:
-        For each: flat pixel indices, ascending; (k, 3) unit vectors from the centre to the surface; and how many pixels
-        the cap has, those beyond the image's edge and behind other spheres with it.
-    """
-    found = []
-    for i, centre in enumerate(centres_mm):
-        middle = lens.project(centre[None])[0]
-        # The outline is a little wider than f R / z; a lens stretches it by less than the rest.
-        reach = 1.5 * radius_mm * float(lens.K[0, 0]) / max(float(centre[2]), radius_mm)
-        low, high = np.floor(middle - reach).astype(int), np.ceil(middle + reach).astype(int) + 1
-        column, row = (g.ravel() for g in np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])))
-        ray = np.column_stack([lens.undistort(np.column_stack([column, row]).astype(float)), np.ones(column.size)])
-        ray /= np.linalg.norm(ray, axis=1)[:, None]
-        depth = _first_hit(ray, centre, radius_mm)
-        with np.errstate(invalid="ignore"):
-            outward = (depth[:, None] * ray - centre) / radius_mm
-            on_cap = np.isfinite(depth) & (outward @ (-centre / np.linalg.norm(centre)) >= CAP_COS)
-        whole = int(on_cap.sum())
-        for other in np.delete(centres_mm, i, axis=0):
-            on_cap &= _first_hit(ray, other, radius_mm) > depth
-        on_cap &= (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
-        found.append(((row[on_cap] * lens.width + column[on_cap]).astype(np.intp), outward[on_cap], whole))
-    return found
-
-
-def _first_hit(ray: Floats, centre: Floats, radius: float) -> Floats:
-    """Depth at which unit rays from the origin meet a sphere; infinity where they miss it."""
-    along = ray @ centre
-    square = along**2 - float(centre @ centre) + radius**2
-    with np.errstate(invalid="ignore"):
-        return np.where(square > 0, along - np.sqrt(np.maximum(square, 0)), np.inf)
 
 
 def plate_spheres(
@@ -171,12 +132,12 @@ def plane_pixels(points_mm: Floats) -> NDArray[np.bool_]:
     if len(good) < LEAST_POINTS:
         raise GeometryError(f"no plane in view: {len(good)} points")
     fit = fit_plane(flat[good[:: max(1, len(good) // PLANE_SAMPLE)]], robust=True)
-    inside = flat[good] @ fit.normal - fit.point_mm @ fit.normal
-    zone = max(PLANE_ZONE * extent_mm(flat[good][np.abs(inside) <= 3 * fit.rms_mm]), 3 * fit.rms_mm)
+    off = distance(flat[good], fit, signed=False)
+    zone = max(PLANE_ZONE * extent_mm(flat[good][off <= 3 * fit.rms_mm]), 3 * fit.rms_mm)
     normals = estimate_normals(points_mm, window=PLANE_WINDOW_PX).reshape(-1, 3)[good]
     along = np.abs(normals @ fit.normal) >= PLANE_LEAN_COS
     near = np.zeros(height * width, np.uint8)
-    near[good[(np.abs(inside) <= zone) & along]] = 1
+    near[good[(off <= zone) & along]] = 1
     # Single pixels without a point do not part a plane.
     closed = cv2.morphologyEx(near.reshape(height, width), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=4)
@@ -213,7 +174,7 @@ def ball_errors(
     rough = np.array([sphere.center_mm for sphere in spheres])
     balls: list[BallError] = []
     centres: list[Floats] = []
-    for i, (pixels, outward, whole) in enumerate(caps(lens, rough, float(spheres[0].radius_mm))):
+    for i, (pixels, outward, whole) in enumerate(sphere_caps(lens, rough, spheres[0].radius_mm)):
         good = np.isfinite(flat[pixels]).all(axis=1)
         points = flat[pixels][good]
         seen = len(points) / max(whole, 1)
@@ -224,12 +185,11 @@ def ball_errors(
             )
         found = probing_error(points, artefact.sphere_diameter, share)
         assert found.size_mm is not None
-        start = np.array([*rough[i], artefact.sphere_diameter / 2])
-        centre = least_squares_sphere(points, start, free=False)[:3]
+        centre = fit_sphere(points, artefact.sphere_diameter / 2, near=spheres[i]).center_mm
         sight = -rough[i] / np.linalg.norm(rough[i])
         right = np.cross(sight, [0.0, -1.0, 0.0])
         right /= np.linalg.norm(right)
-        across = outward[good] @ np.stack([right, np.cross(right, sight)], axis=1) / math.sqrt(1 - CAP_COS**2)
+        across = outward[good] @ np.stack([right, np.cross(right, sight)], axis=1) / CAP_SIN
         centres.append(centre)
         balls.append(
             BallError(
@@ -274,7 +234,8 @@ def plane_error(shot: str, points_mm: Floats, lens: Lens, spec: PlaneSpec | None
     if seen < LEAST_SEEN or good.sum() < LEAST_POINTS:
         raise GeometryError(f"{int(good.sum())} points on {100 * seen:.0f} % of the plane in view")
     found = flatness_error(points[good], share)
-    middle, normal = found.fit[:3], found.fit[3:]
+    assert isinstance(found.fit, PlaneFit)
+    middle, normal = found.fit.point_mm, found.fit.normal
     axes = np.linalg.eigh(np.cov(points[good].T))[1][:, :0:-1]
     flat = (points[good] - middle) @ axes
     # Single points far off would stretch the rectangle.

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import KdTree
+from weldscan._weldcore import KdTree, quadric_distances
 from weldscan.calibration.artefact import TOUCH_SIGMA_MM
 from weldscan.calibration.hand_eye import point_uncertainty_mm, pose_sigma
 from weldscan.errors import InputError, NotMeasured
@@ -24,17 +24,6 @@ Floats = NDArray[np.float64]
 # The patch of surface around a probed point: wide enough to average a scanner's noise over hundreds of points, small
 # against a pipe's radius and a bead's width, so that a quadric describes it.
 PATCH_MM = 1.5
-# Six coefficients, five times over.
-MIN_PATCH_POINTS = 30
-# Where the patch's points lie to one side of the probed point by more than this share of its radius, the surface ends
-# there, and the quadric would be extrapolated. A half disc is off by 0.42.
-MAX_ONE_SIDED = 0.3
-# A probed point further off than this from its patch does not belong to this surface.
-MAX_DISTANCE_MM = PATCH_MM
-
-
-# Points whose noise goes together, about: the decode of a pixel draws on the same projector column as its neighbours.
-CORRELATED_POINTS = 4
 
 
 def validate(
@@ -89,18 +78,15 @@ def hold_against(
     software: dict[str, str] | None = None,
 ) -> Validation:
     """`validate` for a cloud that is there already; `shared` are the uncertainties that all points have in common."""
-    angle, axial = (np.full(len(touched_mm), np.nan) for _ in range(2))
-    distance, noise = np.full(len(touched_mm), np.nan), np.full(len(touched_mm), np.nan)
-    outwards = _outwards(cloud)
     _, near = KdTree(cloud.points_mm).radius(touched_mm, PATCH_MM)
+    distance, noise, normal = quadric_distances(cloud.points_mm, touched_mm, near, PATCH_MM)
+    angle, axial = (np.full(len(touched_mm), np.nan) for _ in range(2))
+    outwards = _outwards(cloud)
     for i, patch in enumerate(near):
-        if len(patch) == 0:
-            continue
-        turn = np.exp(1j * np.radians(cloud.angle_deg[patch].astype(float))).mean()
-        angle[i], axial[i] = np.degrees(np.angle(turn)) % 360, cloud.axial_mm[patch].mean()
-        held = _distance(touched_mm[i], cloud.points_mm[patch], outwards(angle[i]))
-        if held is not None:
-            distance[i], noise[i] = held
+        if len(patch):
+            turn = np.exp(1j * np.radians(cloud.angle_deg[patch].astype(float))).mean()
+            angle[i], axial[i] = np.degrees(np.angle(turn)) % 360, cloud.axial_mm[patch].mean()
+            distance[i] *= 1.0 if normal[i] @ outwards(angle[i]) > 0 else -1.0
     good = np.isfinite(distance)
     if not good.any():
         raise NotMeasured(f"none of the {len(touched_mm)} probed points lies on scanned surface")
@@ -135,31 +121,3 @@ def _outwards(cloud: PartCloud) -> Callable[[float], Floats]:
     terms = np.stack([np.ones_like(angle), cloud.axial_mm[few], np.cos(angle), np.sin(angle)], axis=1)
     _, _, zero, quarter = np.linalg.lstsq(terms, cloud.points_mm[few], rcond=None)[0]
     return lambda deg: math.cos(math.radians(deg)) * zero + math.sin(math.radians(deg)) * quarter
-
-
-def _distance(point: Floats, patch: Floats, outward: Floats) -> tuple[float, float] | None:
-    """Signed distance of a point from the quadric through its patch, and the quadric's standard uncertainty there."""
-    if len(patch) < MIN_PATCH_POINTS:
-        return None
-    aside, along, normal = np.linalg.svd(patch - patch.mean(axis=0), full_matrices=False)[2]
-    normal = normal if normal @ outward > 0 else -normal
-    offset = patch - point
-    u, v, w = offset @ aside, offset @ along, offset @ normal
-    if math.hypot(u.mean(), v.mean()) > MAX_ONE_SIDED * PATCH_MM:
-        return None
-    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
-    keep = np.ones(len(w), bool)
-    for _ in range(2):
-        solution = np.linalg.lstsq(terms[keep], w[keep], rcond=None)[0]
-        residual = w - terms @ solution
-        sigma = float(np.sqrt(np.square(residual[keep]).sum() / (keep.sum() - 6)))
-        keep = np.abs(residual) <= 3 * max(sigma, 1e-9)
-        if keep.sum() < MIN_PATCH_POINTS:
-            return None
-    height, slope_u, slope_v = (float(value) for value in solution[:3])
-    if abs(height) > MAX_DISTANCE_MM:
-        return None
-    # The point is the origin: it stands -height above the quadric, measured along w, hence the cosine of the slope.
-    variance = sigma**2 * float(np.linalg.inv(terms[keep].T @ terms[keep])[0, 0])
-    # Neighbouring pixels share camera and projector pixels; a patch holds fewer independent points than points.
-    return -height / math.sqrt(1 + slope_u**2 + slope_v**2), math.sqrt(variance * CORRELATED_POINTS)

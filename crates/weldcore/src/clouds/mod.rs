@@ -5,3 +5,4 @@ pub mod icp;
 pub mod kdtree;
 pub mod mesh;
 pub mod normals;
+pub mod quadric;

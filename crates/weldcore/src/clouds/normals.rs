@@ -8,6 +8,7 @@ use rayon::prelude::*;
 use crate::clouds::kdtree::{Aside, KdTree, Nearby};
 use crate::error::{Error, Result, require_count};
 use crate::ground::memory::{filled, require, room};
+use crate::ground::robust::median;
 use crate::ground::stop::{poll, polled};
 use crate::ground::threads;
 
@@ -64,11 +65,7 @@ fn common_distance(points: &[[f64; 3]], width: usize) -> f64 {
     let rows: Vec<Vec<f64>> =
         threads::install(|| points.par_chunks(width).step_by(3).inspect(polled).map(distances).collect());
     let mut all: Vec<f64> = rows.into_iter().flatten().collect();
-    if all.is_empty() {
-        return 0.0;
-    }
-    let middle = all.len() / 2;
-    all.select_nth_unstable_by(middle, f64::total_cmp).1.sqrt()
+    median(&mut all).sqrt()
 }
 
 struct PixelGrid<'a> {

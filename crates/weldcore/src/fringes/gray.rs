@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::ground::memory::require;
-use crate::ground::robust::median;
+use crate::ground::robust::{MEDIAN_TO_SIGMA, median};
 use crate::ground::stop::polled;
 use crate::ground::threads::{self, CHUNK};
 
@@ -21,8 +21,6 @@ pub enum GrayImages<'a, T> {
 
 /// Safety factor on the noise, as [`crate::fringes::DecodeOptions`] has it.
 const Z: f64 = 5.0;
-/// The median of the absolute values of normal noise, times this, is its standard deviation.
-const MAD: f64 = 1.4826;
 /// Standard deviation of rounding to whole grey levels: 1/sqrt(12).
 const ROUNDING: f64 = 0.288_675;
 /// Pixels that the noise is taken from: they give it to half a per cent.
@@ -50,13 +48,14 @@ fn least_contrast<T: Copy + Into<f64>>(bits: &[&[T]], against: &GrayImages<'_, T
                 bits.iter().map(move |b| (at(b, i) - white).abs().min((at(b, i) - black).abs()))
             });
             // A miss is of two levels; twice the level less white and black, of six.
-            Z * 3f64.sqrt() * (MAD * finite_median(misses.collect())).max(floor * 2f64.sqrt())
+            Z * 3f64.sqrt() * (MEDIAN_TO_SIGMA * finite_median(misses.collect())).max(floor * 2f64.sqrt())
         }
         GrayImages::Inverse(inverse) => {
             let sums = |i: usize| bits.iter().zip(*inverse).map(move |(a, b)| at(a, i) + at(b, i));
             let differ = |i: usize| sums(i).zip(sums(i).skip(1)).map(|(a, b)| (a - b).abs());
             let differences: Vec<f64> = (0..n).step_by(stride).flat_map(differ).collect();
-            let level = if bits.len() < 2 { 1.0 } else { (MAD * finite_median(differences) / 2.0).max(floor) };
+            let level =
+                if bits.len() < 2 { 1.0 } else { (MEDIAN_TO_SIGMA * finite_median(differences) / 2.0).max(floor) };
             Z * 2f64.sqrt() * level
         }
     }

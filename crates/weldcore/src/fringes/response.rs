@@ -21,6 +21,7 @@ use super::phase_error::{
 use super::shot::{FringeSet, Shot, starts};
 use super::wave::{Level, Sinusoid, TILE, Wave, demodulate, round, turns};
 use crate::error::{Error, Result, require_positive};
+use crate::ground::robust::{MEDIAN_TO_SIGMA, TUKEY_SIGMAS, nth};
 use crate::ground::stop::polled;
 use crate::ground::threads;
 
@@ -39,13 +40,10 @@ const PER_ROW: usize = 160;
 const FEWEST: usize = 500;
 /// Pairs of rows in which the slope of the phase is looked at.
 const PROBES: usize = 8;
-/// Reweighted solutions; Tukey's constant.
+/// Reweighted solutions.
 const ITERATIONS: usize = 10;
 /// A tenth of what the coefficients are known to, rad.
 const CONVERGED: f64 = 2e-5;
-const TUKEY: f64 = 4.685;
-/// The median of |x| over the standard deviation of x.
-const MEDIAN_TO_SIGMA: f64 = 1.482_6;
 type Coefficients = SVector<f64, FITTED>;
 type Square = SMatrix<f64, FITTED, FITTED>;
 
@@ -138,11 +136,7 @@ fn wrap(x: f32) -> f32 {
 }
 
 fn median(values: &mut [f32]) -> Option<f32> {
-    if values.is_empty() {
-        return None;
-    }
-    let middle = values.len() / 2;
-    Some(*values.select_nth_unstable_by(middle, f32::total_cmp).1)
+    nth(values, values.len() / 2)
 }
 
 /// Three phases of a row or column, a lag apart, turns.
@@ -298,7 +292,7 @@ impl ErrorFit {
         let rows: Vec<_> = self.rows.iter().map(|r| misses(r, &known)).collect();
         if anew {
             let mut sizes: Vec<f32> = rows.iter().flatten().map(|(miss, _)| miss.abs()).collect();
-            self.scale = (TUKEY * MEDIAN_TO_SIGMA) as f32 * median(&mut sizes)?.max(1e-6);
+            self.scale = (TUKEY_SIGMAS * MEDIAN_TO_SIGMA) as f32 * median(&mut sizes)?.max(1e-6);
         }
         Some(rows.iter().map(|r| normal(r, self.scale)).collect())
     }

@@ -12,7 +12,9 @@ use crate::ground::stop::{Stopped, attended};
 pub(crate) fn raise(py: Python<'_>, error: &Error) -> PyErr {
     let class = match error {
         Error::Shape { .. } | Error::NonFinite { .. } | Error::OutOfRange { .. } | Error::Image { .. } => "InputError",
-        Error::TooFew { .. } | Error::Degenerate { .. } | Error::NotFound { .. } => "GeometryError",
+        Error::TooFew { .. } | Error::Degenerate { .. } | Error::NoAnswer { .. } | Error::NotFound { .. } => {
+            "GeometryError"
+        }
     };
     raise_as(py, class, error.to_string())
 }

@@ -1,5 +1,9 @@
 //! Segmentation and step for Python: the two calls of `weldscan.measure.inspection`.
 
+mod agreement;
+mod paper;
+mod whitening;
+
 use numpy::{
     IntoPyArray, Ix3, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArrayDyn,
     PyUntypedArrayMethods,
@@ -335,6 +339,9 @@ fn seam_fates<'py>(
 }
 
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    agreement::register(m)?;
+    paper::register(m)?;
+    whitening::register(m)?;
     m.add_function(wrap_pyfunction!(seam_fates, m)?)?;
     m.add_class::<WeldShot>()?;
     m.add_function(wrap_pyfunction!(segment_weld, m)?)?;

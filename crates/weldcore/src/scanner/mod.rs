@@ -2,6 +2,7 @@
 
 pub mod lens;
 pub mod reference_plane;
+pub mod sphere_caps;
 pub mod triangulate;
 
 pub use lens::{Axis, Lens, Rays, Scanner};

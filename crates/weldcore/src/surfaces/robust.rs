@@ -14,6 +14,7 @@ use super::sphere::{self, Sphere};
 use crate::error::{Error, Result, require_count, require_finite, require_positive};
 use crate::ground::memory::require;
 use crate::ground::random::Counter;
+use crate::ground::robust::{MEDIAN_SIGMAS, TUKEY_SIGMAS, median, nth, tukey};
 use crate::ground::threads;
 use crate::ground::transform::Vec3;
 
@@ -28,12 +29,8 @@ const SAMPLES: u64 = 512;
 const QUANTILE: f64 = 1.0 / 3.0;
 /// Normal quantile: the third smallest |residual| of undisturbed data is 0.4307 sigma.
 const QUANTILE_SIGMAS: f64 = 0.4307;
-/// Median of |residual| of a normal distribution, in sigma.
-const MEDIAN_SIGMAS: f64 = 0.6745;
 /// Points further from the surface than this many sigma are outliers.
 const GATE: f64 = 3.0;
-/// Tukey's biweight has 95 % efficiency at this many sigma.
-const TUKEY: f64 = 4.685;
 /// Rounds of reweighting; the scale settles in about five.
 const ROUNDS: usize = 30;
 
@@ -161,8 +158,8 @@ fn sampled<const N: usize, S: Send>(
 /// A quantile of the points' absolute distances.
 fn quantile(points: &[[f64; 3]], distance: impl Fn(&[f64; 3]) -> f64, share: f64) -> f64 {
     let mut sizes: Vec<f64> = points.iter().map(|p| distance(p).abs()).collect();
-    let at = ((sizes.len() as f64 * share) as usize).min(sizes.len().saturating_sub(1));
-    if sizes.is_empty() { f64::INFINITY } else { *sizes.select_nth_unstable_by(at, f64::total_cmp).1 }
+    let at = (sizes.len() as f64 * share) as usize;
+    nth(&mut sizes, at).unwrap_or(f64::INFINITY)
 }
 
 /// The surface of least truncated cost, at three times the scale of the one of least quantile. The first of equals.
@@ -223,17 +220,13 @@ fn reweighted<S: Copy + Sync>(
             let mut sizes: Vec<f64> =
                 current.iter().map(|r| r.abs()).filter(|r| *r <= GATE * sigma + rounding).collect();
             if !sizes.is_empty() {
-                let at = sizes.len() / 2;
-                sigma = *sizes.select_nth_unstable_by(at, f64::total_cmp).1 / MEDIAN_SIGMAS;
+                sigma = median(&mut sizes) / MEDIAN_SIGMAS;
             }
         }
-        let width = TUKEY * sigma + rounding;
+        let width = TUKEY_SIGMAS * sigma + rounding;
         let used = within(&current, width);
-        let weights: Vec<f64> = used
-            .iter()
-            .filter_map(|&i| current.get(i))
-            .map(|r| (1.0 - (r / width).powi(2)).powi(2).max(f64::MIN_POSITIVE))
-            .collect();
+        let weights: Vec<f64> =
+            used.iter().filter_map(|&i| current.get(i)).map(|r| tukey(r / width).max(f64::MIN_POSITIVE)).collect();
         require_count("points near one surface", needed, used.len())?;
         let fit = refine(&gather(&used), &surface, PointNoise { weights: Some(&weights), sigma_mm: None })?;
         surface = fit.surface;

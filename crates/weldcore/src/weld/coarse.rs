@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::pipe_frame::PipeFrame;
 use crate::error::{Error, Result, require_count};
-use crate::ground::robust::median;
+use crate::ground::robust::{MEDIAN_TO_SIGMA, TUKEY_SIGMAS, median, tukey};
 use crate::ground::stop::polled;
 use crate::ground::threads;
 use crate::ground::transform::Vec3;
@@ -79,7 +79,7 @@ fn axis_from_normals(seen: &[(Vec3, Vec3)], prior: Option<Vec3>) -> Result<Vec3>
         // Flanks of the bead and rubbish lean towards the axis: weight them down by what is usual.
         let scale = axis.map(|a| {
             let mut lean: Vec<f64> = seen.iter().map(|(_, n)| n.dot(&a).abs()).collect();
-            3.0 * 1.4826 * median(&mut lean).max(1e-3)
+            3.0 * MEDIAN_TO_SIGMA * median(&mut lean).max(1e-3)
         });
         let mut spread = Matrix3::zeros();
         for (_, n) in seen {
@@ -137,7 +137,7 @@ fn refine_centre(seen: &[(Vec3, Vec3)], frame: &mut PipeFrame) {
     for _ in 0..10 {
         let deviation = |p: &Vec3| frame.unroll(&(*p).into());
         let mut sizes: Vec<f64> = seen.iter().map(|(p, _)| deviation(p)[2].abs()).collect();
-        let scale = 4.685 * 1.4826 * median(&mut sizes).max(1e-6);
+        let scale = TUKEY_SIGMAS * MEDIAN_TO_SIGMA * median(&mut sizes).max(1e-6);
         let (mut xx, mut xy, mut yy, mut bx, mut by) = (0.0, 0.0, 0.0, 0.0, 0.0);
         for (p, _) in seen {
             let [angle, _, d] = deviation(p);
@@ -159,9 +159,4 @@ fn refine_centre(seen: &[(Vec3, Vec3)], frame: &mut PipeFrame) {
             return;
         }
     }
-}
-
-/// Tukey's biweight, zero beyond 1.
-fn tukey(u: f64) -> f64 {
-    if u.abs() < 1.0 { (1.0 - u * u).powi(2) } else { 0.0 }
 }

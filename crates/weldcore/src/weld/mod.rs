@@ -1,13 +1,16 @@
 //! The weld: its walls and cap, the step around the seam, and what became of every pixel.
 
+pub mod agreement;
 mod coarse;
 mod label;
+pub mod paper;
 mod pipe_frame;
 pub mod place;
 pub mod seam_fates;
 pub mod sections;
 pub mod segment;
 pub mod step;
+pub mod whitening;
 
 pub use coarse::Nominal;
 pub use label::{Fate, Label};

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from weldscan.devices.robots.wire import Cut, Link, Transport
 from weldscan.errors import DeviceError, DeviceTimeout
+from weldscan.geometry import rotation_angle
 from weldscan.pose import KukaPose
 
 FARTHEST_MM = 10_000.0
@@ -89,9 +90,7 @@ class Reading:
 def distance(a: KukaPose, b: KukaPose) -> tuple[float, float]:
     """Return how far two poses are apart: mm, and degrees of the one rotation between them."""
     turn = a.matrix()[:3, :3].T @ b.matrix()[:3, :3]
-    sine = 0.5 * math.sqrt(sum((turn[i, j] - turn[j, i]) ** 2 for i, j in ((0, 1), (1, 2), (2, 0))))
-    angle = math.atan2(sine, 0.5 * (float(np.trace(turn)) - 1.0))
-    return math.dist(a.values()[:3], b.values()[:3]), math.degrees(angle)
+    return math.dist(a.values()[:3], b.values()[:3]), math.degrees(rotation_angle(turn))
 
 
 class Robot(abc.ABC):

@@ -5,7 +5,6 @@ request.
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import socket
 import threading
@@ -22,7 +21,8 @@ import numpy as np
 from weldscan.devices.robots import distance
 from weldscan.devices.robots.wire import Cut, Messages, TcpTransport, Transport
 from weldscan.errors import DeviceError, DeviceTimeout
-from weldscan.pose import Floats, KukaPose
+from weldscan.geometry import rigid, rotation_of, rotation_vector_of
+from weldscan.pose import KukaPose
 from weldscan.simulated.controllers.kinematics import ArmGeometry, Joints
 
 HOME_JOINTS: Joints = (0.0, -90.0, 90.0, 0.0, 30.0, 0.0)
@@ -91,10 +91,8 @@ class Arm:
         if done == 1.0:
             return self._target
         a, b = self._start.matrix(), self._target.matrix()
-        between = np.eye(4)
-        between[:3, 3] = (1 - done) * a[:3, 3] + done * b[:3, 3]
-        between[:3, :3] = a[:3, :3] @ _partial_turn(a[:3, :3].T @ b[:3, :3], done)
-        return KukaPose.from_matrix(between)
+        turn = a[:3, :3] @ rotation_of(done * rotation_vector_of(a[:3, :3].T @ b[:3, :3]))
+        return KukaPose.from_matrix(rigid(turn, (1 - done) * a[:3, 3] + done * b[:3, 3]))
 
     @property
     def moving(self) -> bool:
@@ -291,16 +289,3 @@ class TcpController(StreamController):
         for peer in list(self._open):
             with contextlib.suppress(OSError):
                 peer.shutdown(socket.SHUT_RDWR)
-
-
-def _partial_turn(turn: Floats, fraction: float) -> Floats:
-    """Rodrigues: a fraction of a rotation, about its own axis."""
-    axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    angle = math.atan2(float(np.linalg.norm(axis)), float(np.trace(turn)) - 1.0)
-    if np.linalg.norm(axis) < 1e-12:
-        return np.eye(3)
-    x, y, z = axis / np.linalg.norm(axis)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    part = angle * fraction
-    result: Floats = np.eye(3) + math.sin(part) * cross + (1.0 - math.cos(part)) * (cross @ cross)
-    return result

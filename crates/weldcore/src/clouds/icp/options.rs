@@ -1,5 +1,6 @@
 //! What is minimised, and how a residual counts.
 
+use crate::ground::robust::{huber, tukey};
 use crate::ground::transform::Transform;
 
 /// What is minimised.
@@ -67,11 +68,8 @@ impl RobustKernel {
     #[inline(always)]
     pub(super) fn weight(self, residual: f64) -> f64 {
         match self {
-            Self::Huber(Some(width)) if residual > width && width > 0.0 => width / residual,
-            Self::Tukey(Some(width)) if width > 0.0 => {
-                let share = residual / width;
-                if share < 1.0 { (1.0 - share * share).powi(2) } else { 0.0 }
-            }
+            Self::Huber(Some(width)) if width > 0.0 => huber(residual, width),
+            Self::Tukey(Some(width)) if width > 0.0 => tukey(residual / width),
             _ => 1.0,
         }
     }

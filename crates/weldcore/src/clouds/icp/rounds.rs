@@ -11,6 +11,7 @@ use crate::clouds::distance::Target;
 use crate::clouds::kdtree::{Followed, order_along};
 use crate::error::{Error, Result};
 use crate::ground::memory::require;
+use crate::ground::robust::{HUBER_SIGMAS, MEDIAN_TO_SIGMA, TUKEY_SIGMAS, median, nth};
 use crate::ground::stop::polled;
 use crate::ground::threads;
 use crate::ground::transform::{Transform, Vec3};
@@ -19,11 +20,6 @@ use crate::ground::transform::{Transform, Vec3};
 const CHUNK: usize = 2048;
 /// The fewest pairs that a round goes on with.
 pub(super) const FEWEST: usize = 3;
-/// The median absolute deviation of normal noise, times this, is its standard deviation.
-const MAD: f64 = 1.4826;
-/// Kernel widths in standard deviations at which robust estimates keep 95 % efficiency on normal noise.
-const HUBER: f64 = 1.345;
-const TUKEY: f64 = 4.685;
 
 /// The rounds on one choice of points.
 pub(super) struct Rounds<'a> {
@@ -112,7 +108,8 @@ impl<'a> Rounds<'a> {
         let near = self.matches.iter().filter(|m| m.distance <= self.limit).count();
         if self.options.trim > 0.0 && near >= FEWEST {
             let keep = ((near as f64 * (1.0 - self.options.trim)).ceil() as usize).max(FEWEST);
-            self.limit = nth(self.counting().map(|(_, m)| m.distance).collect(), keep - 1);
+            let mut distances: Vec<f64> = self.counting().map(|(_, m)| m.distance).collect();
+            self.limit = nth(&mut distances, keep - 1).unwrap_or(0.0);
         }
         let got = self.counting().count();
         if got < FEWEST {
@@ -120,13 +117,12 @@ impl<'a> Rounds<'a> {
             return Err(Error::NotFound { what: "pairs", reason });
         }
         let width = |deviations: f64| {
-            let residuals: Vec<f64> = self.counting().map(|(p, m)| self.residual(&pose.apply(&p), m)).collect();
-            let middle = residuals.len() / 2;
-            Some(nth(residuals, middle) * MAD * deviations)
+            let mut residuals: Vec<f64> = self.counting().map(|(p, m)| self.residual(&pose.apply(&p), m)).collect();
+            Some(median(&mut residuals) * MEDIAN_TO_SIGMA * deviations)
         };
         self.kernel = match self.options.kernel {
-            RobustKernel::Huber(None) => RobustKernel::Huber(width(HUBER)),
-            RobustKernel::Tukey(None) => RobustKernel::Tukey(width(TUKEY)),
+            RobustKernel::Huber(None) => RobustKernel::Huber(width(HUBER_SIGMAS)),
+            RobustKernel::Tukey(None) => RobustKernel::Tukey(width(TUKEY_SIGMAS)),
             given => given,
         };
         Ok(())
@@ -206,12 +202,6 @@ impl<'a> Rounds<'a> {
         answer.unobserved = name(&null, &center, self.size);
         Ok(answer)
     }
-}
-
-/// The `n`-th smallest of some distances.
-fn nth(mut values: Vec<f64>, n: usize) -> f64 {
-    let n = n.min(values.len().saturating_sub(1));
-    if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(n, f64::total_cmp).1 }
 }
 
 /// `wanted` of `0..n`, one from each of as many equal runs, at places in them that follow no period of an image's rows.

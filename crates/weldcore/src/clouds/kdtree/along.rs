@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 
 use super::boxes::{max, min};
+use crate::ground::robust::median;
 use crate::ground::stop::polled;
 
 /// Fewer queries than this are not worth ordering.
@@ -40,8 +41,7 @@ pub(crate) fn order_along(points: &[[f64; 3]]) -> Option<Vec<u32>> {
         .step_by(PAIRS)
         .map(|pair| (0..3).map(|k| (pair[1][k] - pair[0][k]).abs()).fold(0.0, max))
         .collect();
-    let middle = steps.len() / 2;
-    let step = *steps.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let step = median(&mut steps);
     // The spacing of as many points on a square surface. Also false where there is no size at all, or no finite one.
     let spacing = size / (points.len() as f64).sqrt();
     if !(step > SCATTERED * spacing && spacing > 0.0 && size.is_finite()) {

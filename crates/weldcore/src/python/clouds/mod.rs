@@ -4,6 +4,7 @@ pub(crate) mod distance;
 pub(crate) mod icp;
 pub(crate) mod kdtree;
 pub(crate) mod normals;
+mod quadric;
 
 use pyo3::prelude::*;
 
@@ -11,5 +12,6 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     distance::register(m)?;
     icp::register(m)?;
     kdtree::register(m)?;
-    normals::register(m)
+    normals::register(m)?;
+    quadric::register(m)
 }

@@ -2,6 +2,7 @@
 
 pub(crate) mod decode;
 pub(crate) mod images;
+mod quality;
 pub(crate) mod response;
 mod unwrap;
 pub(crate) mod wrapped;
@@ -11,6 +12,7 @@ use pyo3::prelude::*;
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     decode::register(m)?;
     wrapped::register(m)?;
+    quality::register(m)?;
     response::register(m)?;
     unwrap::register(m)
 }

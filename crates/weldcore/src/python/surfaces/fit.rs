@@ -7,6 +7,8 @@ use crate::error::Error;
 use crate::ground::transform::Vec3;
 use crate::python::call::{compute, raise};
 use crate::python::convert::{self, array, float_matrix, floats, points as as_points, whole};
+use crate::python::surfaces::find_spheres::PyFoundSphere;
+use crate::python::surfaces::shapes::PySphere;
 use crate::surfaces::{Fit, PointNoise, cylinder, plane, robust, sphere};
 
 /// What the three results have in common.
@@ -169,6 +171,17 @@ result_class!(
     }
 );
 
+/// The sphere of an object: a sphere, a fit of one, one that was found.
+pub(crate) fn sphere_of(object: &Bound<'_, PyAny>) -> Option<sphere::Sphere> {
+    if let Ok(sphere) = object.cast::<PySphere>() {
+        Some(sphere.get().0)
+    } else if let Ok(fit) = object.cast::<SphereFit>() {
+        Some(fit.get().surface)
+    } else {
+        object.cast::<PyFoundSphere>().ok().map(|found| found.get().0.sphere)
+    }
+}
+
 /// Weights as an optional array.
 fn weights_of<'py>(
     points: &PyReadonlyArray2<'_, f64>,
@@ -242,6 +255,7 @@ fn fit_plane(
 /// Args:
 ///     points: (n, 3) float64, n >= 4 (3 with a given radius), mm, any frame.
 ///     radius_mm: the radius where it is known (a calibrated ball seen as a cap); None: it is fitted.
+///     near: a sphere, or a fit of one, to begin at; None: at the algebraic sphere, which points far off lead astray.
 ///     weights: (n,) float64, relative weights 1/sigma**2; None: all equal. Not together with `robust`.
 ///     sigma_mm: standard deviation of a point (of weight 1) along the normal; None: the residuals tell it.
 ///     robust: outliers may be present (up to 60 %): MSAC start, reweighting, and a last fit without truncation on the
@@ -264,11 +278,13 @@ fn fit_plane(
 ///     >>> round(ball.radius_mm, 9)
 ///     2.0
 #[pyfunction]
-#[pyo3(signature = (points, radius_mm=None, *, weights=None, sigma_mm=None, robust=false, seed=0))]
+#[pyo3(signature = (points, radius_mm=None, *, near=None, weights=None, sigma_mm=None, robust=false, seed=0))]
+#[allow(clippy::too_many_arguments)] // Python's keywords.
 fn fit_sphere(
     py: Python<'_>,
     points: &Bound<'_, PyAny>,
     radius_mm: Option<f64>,
+    near: Option<&Bound<'_, PyAny>>,
     weights: Option<&Bound<'_, PyAny>>,
     sigma_mm: Option<f64>,
     robust: bool,
@@ -277,6 +293,16 @@ fn fit_sphere(
     let array = float_matrix("points", points)?;
     let weights = weights_of(&array, weights, robust)?;
     let (list, weights) = (as_points("points", &array)?, weights.as_ref().map(|w| w.as_slice()).transpose()?);
+    if let Some(near) = near {
+        let wrong =
+            |got: String| raise(py, &Error::Shape { what: "near", expected: "a sphere, without robust".into(), got });
+        let Some(mut start) = sphere_of(near).filter(|_| !robust) else {
+            return Err(wrong(near.get_type().name()?.to_string()));
+        };
+        start.radius_mm = radius_mm.unwrap_or(start.radius_mm);
+        let noise = PointNoise { weights, sigma_mm };
+        return Ok(SphereFit::of(&compute(py, || sphere::refine(list, start, radius_mm.is_none(), noise))?, None));
+    }
     if robust {
         let (fit, inliers) = compute(py, || robust::sphere(list, radius_mm, sigma_mm, seed as u64))?;
         return Ok(SphereFit::of(&fit, Some(inliers)));

@@ -7,6 +7,7 @@ use nalgebra::Matrix3;
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
+use crate::ground::robust::median;
 use crate::ground::stop::{poll, polled};
 use crate::ground::threads::{self, CHUNK};
 use crate::ground::transform::Vec3;
@@ -159,8 +160,7 @@ fn tile_size(points: &[[f64; 3]], width: usize, radius: f64) -> (usize, f64) {
     if pitches.is_empty() {
         return (2, radius);
     }
-    let middle = pitches.len() / 2;
-    let pitch = *pitches.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let pitch = median(&mut pitches);
     let tile = ((radius / 8.0 / pitch) as usize).clamp(2, 64);
     (tile, tile as f64 * pitch)
 }

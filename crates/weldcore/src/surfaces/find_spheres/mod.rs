@@ -16,6 +16,7 @@ use self::votes::Votes;
 use super::least_squares::PointNoise;
 use super::sphere::{self, Sphere};
 use crate::error::{Error, Result, require_finite, require_positive};
+use crate::ground::robust::{MEDIAN_SIGMAS, median};
 use crate::ground::transform::Vec3;
 
 /// The cap that counts: half-angle about the line of sight. Beyond it light falls and is seen too obliquely; the same
@@ -174,9 +175,7 @@ impl CelledCloud<'_> {
                 return Err(format!("only {} points", zone.len()));
             }
             let mut sizes: Vec<f64> = zone.iter().map(|z| z.2.abs()).collect();
-            let middle = sizes.len() / 2;
-            // The median of |residual| of a normal distribution is 0.6745 sigma.
-            sigma = *sizes.select_nth_unstable_by(middle, f64::total_cmp).1 / 0.6745;
+            sigma = median(&mut sizes) / MEDIAN_SIGMAS;
             let gate = self.gate(sigma, center);
             let on: Vec<[f64; 3]> = zone.iter().filter(|z| z.2.abs() <= gate).map(|z| self.points[z.0]).collect();
             let step = fixed_step(&on, center, radius).ok_or("the points do not determine a sphere")?;
@@ -276,8 +275,7 @@ impl CelledCloud<'_> {
             .map(|(_, c)| ((c.mean - center).norm() - radius).abs())
             .filter(|r| *r < ZONE * radius)
             .collect();
-        let middle = sizes.len() / 2;
-        if sizes.is_empty() || *sizes.select_nth_unstable_by(middle, f64::total_cmp).1 > NOISE * radius {
+        if sizes.is_empty() || median(&mut sizes) > NOISE * radius {
             return Err(format!("its surroundings do not lie on a sphere of radius {radius} mm"));
         }
         Ok(center)

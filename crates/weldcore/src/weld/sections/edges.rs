@@ -4,7 +4,7 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::profile::Profile;
-use crate::ground::robust::median;
+use crate::ground::robust::{MEDIAN_TO_SIGMA, huber, median};
 
 /// The first strip beside a toe is rounded by the toe itself and by the size of a pixel. On it, and as far again as a part
 /// of the cap's height, the cap's flank throws light that pulls the phase by some hundredths of a millimetre.
@@ -118,8 +118,8 @@ fn stretch(profile: &Profile, toe: f64, [clear, length]: [f64; 2], degree: usize
         let c = &inverse * (weighted.transpose() * &heights);
         let residuals = &heights - &rows * &c;
         let mut sizes: Vec<f64> = residuals.iter().map(|r| r.abs()).collect();
-        let scale = (1.4826 * median(&mut sizes)).max(sigma).max(1e-9);
-        residuals.iter().zip(weights.iter_mut()).for_each(|(r, w)| *w = (HUBER * scale / r.abs().max(1e-12)).min(1.0));
+        let scale = (MEDIAN_TO_SIGMA * median(&mut sizes)).max(sigma).max(1e-9);
+        residuals.iter().zip(weights.iter_mut()).for_each(|(r, w)| *w = huber(*r, HUBER * scale));
         fit = Some(StretchFit { value: c[0], slope: c[1] / length, variance: scale * scale * inverse[(0, 0)] });
     }
     fit

@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use crate::error::{Error, Result, require_count};
-use crate::ground::robust::median;
+use crate::ground::robust::{MEDIAN_TO_SIGMA, median, median_between};
 use crate::ground::threads;
 use crate::weld::pipe_frame::{PipeFrame, Unrolled};
 
@@ -202,7 +202,7 @@ impl Grid {
             .flat_map(|k| self.row(k).windows(3).map(|w| (w[0] - 2.0 * w[1] + w[2]).abs()))
             .filter(|b| b.is_finite())
             .collect();
-        if bends.is_empty() { 0.0 } else { 1.4826 * median(&mut bends) / 6f64.sqrt() }
+        if bends.is_empty() { 0.0 } else { MEDIAN_TO_SIGMA * median(&mut bends) / 6f64.sqrt() }
     }
 }
 
@@ -212,21 +212,13 @@ fn cell_statistics(values: &mut [f32]) -> (f64, f64, usize) {
     if n < LEAST_POINTS {
         return (f64::NAN, f64::NAN, n);
     }
-    let middle = |values: &mut [f32]| {
-        let high = *values.select_nth_unstable_by(n / 2, f32::total_cmp).1;
-        if n % 2 == 1 {
-            return f64::from(high);
-        }
-        let low = values[..n / 2].iter().copied().fold(f32::NEG_INFINITY, f32::max);
-        0.5 * (f64::from(low) + f64::from(high))
-    };
-    let m = middle(values);
+    let m = median_between(values);
     if n < NOISE_POINTS {
         return (m, f64::NAN, n);
     }
     values.iter_mut().for_each(|v| *v = (*v - m as f32).abs());
     // Of few values the MAD is too small by about this factor (Croux and Rousseeuw, COMPSTAT 1992, 411).
-    (m, 1.4826 * middle(values) * n as f64 / (n as f64 - 0.8), n)
+    (m, MEDIAN_TO_SIGMA * median_between(values) * n as f64 / (n as f64 - 0.8), n)
 }
 
 /// The range of values without its outermost thousandth on either side: stray points do not stretch the view.

@@ -42,7 +42,7 @@ pub(super) fn toe(profile: &Profile, begin: usize, end: usize, sigma: f64, band:
         // Each by its own: a flank is less of a parabola than a wall, and must not go for it.
         let [flank, wall] = [from..best, best..to].map(|bins| {
             let mut sizes: Vec<f64> = bins.map(off).filter(|d| d.is_finite()).collect();
-            CLIP_MADS * (1.4826 * crate::ground::robust::median(&mut sizes)).max(sigma)
+            CLIP_MADS * (crate::ground::robust::MEDIAN_TO_SIGMA * crate::ground::robust::median(&mut sizes)).max(sigma)
         });
         profile.keeping(|i| i < from || i >= to || off(i) <= if i < best { flank } else { wall })
     };

@@ -46,6 +46,7 @@ use cells::{Arc, Cell, WallGrid, arc_of, grid_of};
 use model::{Model, Terms, corrected, second_order};
 use profile::{BIN_DEG, Departures, mean_and_median, seen_bins};
 use solve::{choose, solve};
+pub(crate) use unevenness::wendland;
 use unevenness::{Covariance, Whitener};
 
 /// What the caller knows of further standard uncertainties (k = 1).

@@ -46,8 +46,7 @@ pub(super) fn mean_and_median(shots: &[LabelledShot], deviations: &[Vec<f32>]) -
         return (f64::NAN, f64::NAN);
     }
     let mean = all.iter().map(|d| f64::from(*d)).sum::<f64>() / all.len() as f64;
-    let middle = all.len() / 2;
-    (mean, f64::from(*all.select_nth_unstable_by(middle, f32::total_cmp).1))
+    (mean, f64::from(median(&mut all)))
 }
 
 /// A bin of the profile that both walls of a shot were seen in.

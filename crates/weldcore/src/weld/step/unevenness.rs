@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use super::cells::{Arc, Cell};
-use crate::ground::robust::median;
+use crate::ground::robust::{MEDIAN_TO_SIGMA, median};
 use crate::ground::stop::{poll, polled};
 use crate::ground::threads;
 
@@ -20,7 +20,7 @@ pub(super) struct Covariance {
 }
 
 /// Wendland's positive definite function of support 1, smooth at 0 as a Gaussian is.
-pub(super) fn wendland(r: f64) -> f64 {
+pub(crate) fn wendland(r: f64) -> f64 {
     if r < 1.0 { (1.0 - r).powi(4) * (4.0 * r + 1.0) } else { 0.0 }
 }
 
@@ -43,7 +43,7 @@ impl Covariance {
     pub(super) fn of(arcs: &[Arc], cells: &[Cell], residuals: &[f64], cell_mm: f64) -> Self {
         // A dent is not unevenness: it must not hide itself by raising what counts as usual.
         let mut sizes: Vec<f64> = residuals.iter().map(|r| r.abs()).collect();
-        let limit = 3.0 * 1.4826 * median(&mut sizes);
+        let limit = 3.0 * MEDIAN_TO_SIGMA * median(&mut sizes);
         let r: Vec<f64> = residuals.iter().map(|v| v.clamp(-limit, limit)).collect();
         let variance = r.iter().map(|v| v * v).sum::<f64>() / r.len() as f64;
         let indices: Vec<usize> = (0..cells.len()).collect();

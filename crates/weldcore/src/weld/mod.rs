@@ -2,8 +2,8 @@
 
 mod coarse;
 mod label;
-mod pipe_frame;
 pub mod place;
+mod seam;
 pub mod seam_fates;
 pub mod sections;
 pub mod segment;
@@ -11,4 +11,4 @@ pub mod step;
 
 pub use coarse::Nominal;
 pub use label::{Fate, Label};
-pub use pipe_frame::{PipeFrame, Unrolled};
+pub use seam::{Course, Seam, Unrolled};

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from weldscan import SeamCourse, SeamFrame
 from weldscan.errors import GeometryError
-from weldscan.measure.paper_method import KEPT_PART, MODEL_SPACING_MM, histogram_step, modelled_pipe, paper_step
+from weldscan.measure.paper_method import KEPT_PART, MODEL_SPACING_MM, histogram_step, modelled_part, paper_step
 
 RADIUS_MM = 315.0
 POINT = np.array([900.0, 40.0, 300.0])
@@ -65,7 +66,8 @@ def test_a_histogram_of_one_value():
 
 def test_the_modelled_pipe_covers_the_scan():
     cloud = weld(0.47)
-    model, normals = modelled_pipe(cloud, POINT, AXIS, RADIUS_MM)
+    seam = SeamFrame(POINT, AXIS, [0.8, 0.0, -0.6], SeamCourse(RADIUS_MM))
+    model, normals = modelled_part(*seam.place(cloud)[:2], seam)
     from_axis = (model - POINT) - ((model - POINT) @ AXIS)[:, None] * AXIS
     np.testing.assert_allclose(np.linalg.norm(from_axis, axis=1), RADIUS_MM, rtol=1e-12)
     np.testing.assert_allclose(normals, from_axis / RADIUS_MM, atol=1e-12)

@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import KdTree, refuse_masked, register_icp
+from weldscan._weldcore import KdTree, SeamCourse, SeamFrame, refuse_masked, register_icp
 from weldscan.errors import GeometryError
 from weldscan.result import Histogram
 
@@ -52,11 +52,13 @@ def paper_step(points_mm: Floats, axis_point_mm: Floats, axis: Floats, radius_mm
     refuse_masked("axis_point_mm", axis_point_mm)
     refuse_masked("axis", axis)
     points_mm = points_mm[:: max(1, len(points_mm) // POINTS)]
-    axial = (points_mm - axis_point_mm) @ axis
-    excess = centroid_excess(points_mm, axial, axis_point_mm, axis, radius_mm)
-    seam = seam_place(axial, excess)
+    aside = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    seam = SeamFrame(axis_point_mm, axis, aside, SeamCourse(radius_mm))
+    at, across, _ = seam.place(points_mm)
+    excess = centroid_excess(points_mm, seam.points(at, across))
+    weld = seam_place(across, excess)
     parts = []
-    for side in (axial < seam, axial > seam):
+    for side in (across < weld, across > weld):
         part = np.flatnonzero(side)
         for _ in range(2):
             if part.size < 100:
@@ -66,7 +68,7 @@ def paper_step(points_mm: Floats, axis_point_mm: Floats, axis: Floats, radius_mm
             part = part[np.abs(excess[part] - middle) <= WALL_SIGMAS * spread]
         parts.append(points_mm[part])
     reference, other = parts
-    model, normals = modelled_pipe(points_mm, axis_point_mm, axis, radius_mm)
+    model, normals = modelled_part(at, across, seam)
     source = reference[:: max(1, len(reference) // ICP_POINTS)]
     fit = register_icp(source, model, metric="plane", normals=normals)
     placed = other @ fit.target_from_source[:3, :3].T + fit.target_from_source[:3, 3]
@@ -75,53 +77,44 @@ def paper_step(points_mm: Floats, axis_point_mm: Floats, axis: Floats, radius_mm
     return histogram_step(distances)
 
 
-def centroid_excess(points_mm: Floats, axial: Floats, axis_point_mm: Floats, axis: Floats, radius_mm: float) -> Floats:
-    """Steps 1, 2: how much further from the centroid each point is than the modelled pipe at its place, mm.
+def centroid_excess(points_mm: Floats, modelled_mm: Floats) -> Floats:
+    """Steps 1, 2: how much further from the centroid each point is than the modelled part at its place, mm.
 
     The bare distance from the centroid grows along and across a curved wall by centimetres, in which a weld 2 mm high
     does not show; less what the model's own form has at the same place it does.
     """
     centroid = points_mm.mean(axis=0)
-    on_axis = axis_point_mm + axial[:, None] * axis
-    outward = points_mm - on_axis
-    modelled = on_axis + outward * (radius_mm / np.linalg.norm(outward, axis=1))[:, None]
-    excess = np.linalg.norm(points_mm - centroid, axis=1) - np.linalg.norm(modelled - centroid, axis=1)
+    excess = np.linalg.norm(points_mm - centroid, axis=1) - np.linalg.norm(modelled_mm - centroid, axis=1)
     return np.asarray(excess)
 
 
-def seam_place(axial: Floats, excess: Floats) -> float:
-    """Where along the axis the weld is: the ring whose median excess departs most from the two walls' own."""
-    low, high = np.quantile(axial, [0.001, 0.999])
-    rings = np.clip(((axial - low) / (high - low) * 200).astype(np.intp), 0, 199)
-    order = np.argsort(rings, kind="stable")
-    groups = np.split(excess[order], np.searchsorted(rings[order], np.arange(1, 200)))
+def seam_place(across: Floats, excess: Floats) -> float:
+    """Where the weld is: the strip along the seam whose median excess departs most from the two walls' own."""
+    low, high = np.quantile(across, [0.001, 0.999])
+    strips = np.clip(((across - low) / (high - low) * 200).astype(np.intp), 0, 199)
+    order = np.argsort(strips, kind="stable")
+    groups = np.split(excess[order], np.searchsorted(strips[order], np.arange(1, 200)))
     medians = np.array([np.median(group) if group.size else np.nan for group in groups])
-    ring = int(np.nanargmax(np.abs(medians - np.nanmedian(medians))))
-    return float(low + (ring + 0.5) / 200 * (high - low))
+    strip = int(np.nanargmax(np.abs(medians - np.nanmedian(medians))))
+    return float(low + (strip + 0.5) / 200 * (high - low))
 
 
-def modelled_pipe(points_mm: Floats, axis_point_mm: Floats, axis: Floats, radius_mm: float) -> tuple[Floats, Floats]:
-    """Step 3: the pipe's surface as a cloud with outward normals, over the arcs and the length that were scanned.
+def modelled_part(at: Floats, across: Floats, seam: SeamFrame) -> tuple[Floats, Floats]:
+    """Step 3: the part's surface as a cloud with outward normals, over what was scanned of it.
 
     Raises:
         GeometryError: that is more than any scan of one part shows.
     """
-    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    across /= np.linalg.norm(across)
-    square = np.cross(axis, across)
-    v = points_mm - axis_point_mm
-    axial, angle = v @ axis, np.arctan2(v @ square, v @ across)
-    step = MODEL_SPACING_MM / radius_mm
+    step = seam.course.difference(MODEL_SPACING_MM)
     # A margin on either side, so that no point finds its nearest neighbour at the model's edge.
-    turns = np.unique(np.floor(angle / step).astype(np.int64))
-    turns = np.unique(turns[:, None] + np.arange(-4, 5)) * step
-    length = float(np.ptp(axial)) / MODEL_SPACING_MM + 8
-    if not length * len(turns) <= MODEL_POINTS:
-        raise GeometryError(f"the points reach over {np.ptp(axial):.4g} mm of the pipe: no modelled pipe is so long")
-    rows = np.arange(axial.min() - 4 * MODEL_SPACING_MM, axial.max() + 4 * MODEL_SPACING_MM, MODEL_SPACING_MM)
-    outward = np.cos(turns)[:, None] * across + np.sin(turns)[:, None] * square
-    model = axis_point_mm + rows[:, None, None] * axis + radius_mm * outward
-    return model.reshape(-1, 3), np.broadcast_to(outward, model.shape).reshape(-1, 3).copy()
+    cells = np.unique(np.floor(at / step).astype(np.int64))
+    places = np.unique(cells[:, None] + np.arange(-4, 5)) * step
+    length = float(np.ptp(across)) / MODEL_SPACING_MM + 8
+    if not length * len(places) <= MODEL_POINTS:
+        raise GeometryError(f"the points reach over {np.ptp(across):.4g} mm of the pipe: no modelled pipe is so long")
+    rows = np.arange(across.min() - 4 * MODEL_SPACING_MM, across.max() + 4 * MODEL_SPACING_MM, MODEL_SPACING_MM)
+    model = seam.points(np.tile(places, len(rows)), np.repeat(rows, len(places)))
+    return model, np.tile(seam.outward(places), (len(rows), 1))
 
 
 def histogram_step(distances_mm: Floats) -> Histogram:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from weldscan.norms import judge
+from weldscan.records.part import course_of
 from weldscan.result import (
     ArtefactShot,
     ArtefactSphere,
@@ -20,7 +21,6 @@ from weldscan.result import (
     PartCloud,
     SeamBin,
     StepResult,
-    along_seam_mm,
     bar,
     note,
     warning,
@@ -216,7 +216,8 @@ def with_findings(
 
 def seam_bin(angle_deg: float, measured: bool, **fate: int) -> SeamBin:
     """One bin, with a cap where it was measured."""
-    along = along_seam_mm(angle_deg, PART)
+    course = course_of(PART)
+    along = course.along_mm(course.at(angle_deg))
     return SeamBin(angle_deg, along, measured, fate, 12.4 if measured else None, (-6.1, 6.3) if measured else None)
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from conftest import shared
 from test_description import CELL, Change, copied, of, pose_of
+from weldscan import SeamCourse
 from weldscan.measure.inspection import inspect
 from weldscan.measure.session_hand_eye import calibrate
 from weldscan.measure.shot_agreement import _unlike, copies
@@ -179,5 +180,7 @@ def profile(step_mm: float, sigma_mm: float = 0.01, **other: float) -> dict[int,
 def test_when_two_profiles_contradict_each_other(
     one: dict[int, tuple[float, float]], other: dict[int, tuple[float, float]], severity: Severity | None
 ) -> None:
-    found = list(_unlike("part-1", "part-2", one, other))
+    course = SeamCourse(136.5)
+    bins = ({round(at / course.bin_width): value for at, value in each.items()} for each in (one, other))
+    found = list(_unlike("part-1", "part-2", course, *bins))
     assert [finding.severity for finding in found] == ([severity] if severity else [])

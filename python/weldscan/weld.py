@@ -2,6 +2,8 @@
 
 from weldscan._later import later
 from weldscan._weldcore import (
+    SeamCourse,
+    SeamFrame,
     WeldShot,
     measure_step,
     place_shots,
@@ -33,6 +35,8 @@ __getattr__ = later(
 )
 
 __all__ = [
+    "SeamCourse",
+    "SeamFrame",
     "WeldShot",
     "inspect",
     "judge",

@@ -26,7 +26,7 @@ from weldscan.measure.observable_terms import seam_terms
 from weldscan.measure.paper_method import paper_step
 from weldscan.measure.part_views import PartView
 from weldscan.measure.scanner_standing import standing_of
-from weldscan.measure.seam_coverage import BIN_DEG, EdgeProfile, Seam, edge_profile, seam_of
+from weldscan.measure.seam_coverage import EdgeProfile, Seam, edge_profile, seam_of
 from weldscan.measure.session_hand_eye import base_from_flange, hand_eye_of
 from weldscan.measure.session_points import Compensate, PointReader, Progress
 from weldscan.measure.shot_agreement import PlacedShot, agreement, complaint, copies, shots_agree
@@ -202,7 +202,7 @@ class _Run:
         segmented: WeldShot | None = None
         refused: str | None = None
         try:
-            segmented = segment_weld(scan.points_mm, part.outside_diameter / 2, part.wall_thickness, axis, zero)
+            segmented = segment_weld(scan.points_mm, part.course.radius_mm, part.wall_thickness, axis, zero)
         except GeometryError as error:
             refused = scan.reading.why_dark or other_part(scan.points_mm, part, axis) or str(error)
         noticed = scan.noticed + took("segment", t)
@@ -238,14 +238,14 @@ class _Run:
         edges = edge_profile(views)
         found = _step_result(step, edges, self.part)
         noticed, t = noticed + took("measure", t), time.perf_counter()
-        measured = np.rint(found.angle_deg / BIN_DEG).astype(int).tolist()
+        measured = np.rint(found.angle_deg / edges.course.bin_width).astype(int).tolist()
         by = "session" if self.required_coverage_deg is None else "option"
         required = self.required_deg
         seam = seam_of(
             views,
             self.read.scanner,
             measured,
-            self.part.outside_diameter / 2,
+            self.part.course,
             required,
             "views" if required is None else by,
         )
@@ -292,15 +292,15 @@ class _Run:
         """Shots that saw the same wall, held against each other in base."""
         shots = [(view.index, self.session.part_shots[view.index]) for view in views]
         placed = [PlacedShot(shot.name, index, base_from_flange(shot)) for index, shot in shots]
-        pairs = agreement(cloud, placed, hand_eye, *views[0].axis_in_base)
+        pairs = agreement(cloud, placed, hand_eye, views[0].seam_in_base)
         said = [said for pair in pairs if (said := complaint(pair)) is not None]
         return pairs, (*said, *shots_agree(views, hand_eye))
 
     def paper(self, cloud: PartCloud, view: PartView) -> tuple[Histogram | None, tuple[Finding, ...]]:
         """The paper's chain; None with a note where it finds no answer."""
-        origin, axis = view.axis_in_base
+        seam = view.seam_in_base
         try:
-            return paper_step(cloud.points_mm, origin, axis, view.shot.radius_mm), ()
+            return paper_step(cloud.points_mm, seam.origin_mm, seam.across, seam.course.radius_mm), ()
         except GeometryError as error:
             return None, (note("paper", f"method paper gave no answer: {error}"),)
 
@@ -531,7 +531,7 @@ def _step_result(step: dict[str, Any], edges: EdgeProfile, part: PartSpec) -> St
     def column(name: str) -> Floats:
         return np.asarray(table[:, columns.index(name)])
 
-    bins = np.rint(column("angle_deg") / BIN_DEG).astype(int) % len(edges.step_mm)
+    bins = np.rint(column("angle_deg") / edges.course.bin_width).astype(int)
     read = np.isfinite(edges.step_mm[bins])
     table, bins = table[read], bins[read]
     wall, wall_u = column("step_mm"), 2 * column("standard_mm")
@@ -551,7 +551,7 @@ def _step_result(step: dict[str, Any], edges: EdgeProfile, part: PartSpec) -> St
             and sum(edges.judged) > upper
             and (edges.confirmed_mm > upper or edges.contradict(bins, wall, wall_u))
         ):
-            (value, u), at, judged = edges.judged, BIN_DEG * edges.worst, "edge"
+            (value, u), at, judged = edges.judged, edges.course.bin_width * edges.worst, "edge"
             derived = "reading beside both toes: noise, choice of the stretch, and what the choice of the toes may hide"
             budget = (BudgetLine("edges", u / 2, derived),)
     terms = seam_terms(step, part.outside_diameter, part.wall_thickness)
@@ -570,7 +570,7 @@ def _step_result(step: dict[str, Any], edges: EdgeProfile, part: PartSpec) -> St
         angle_between_walls_deg=terms.angle_deg,
         angle_between_walls_u_deg=terms.angle_u_deg,
         not_observable=terms.not_observable,
-        coverage_deg=BIN_DEG * len(table),
+        coverage_deg=edges.course.bin_width * len(table),
         judged=judged,
         edge_upper_mm=None if edges.judged is None else sum(edges.judged),
         wall_step_mm=wall,

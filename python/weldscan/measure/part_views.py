@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import WeldShot
+from weldscan._weldcore import SeamFrame, WeldShot
 
 Floats = NDArray[np.float64]
 
@@ -30,7 +30,6 @@ class PartView:
     shot: WeldShot
 
     @property
-    def axis_in_base(self) -> tuple[Floats, Floats]:
-        """A point of the pipe's axis, at the seam's centreline, and its direction."""
-        turn, shift = self.base_from_scanner[:3, :3], self.base_from_scanner[:3, 3]
-        return turn @ self.shot.origin_mm + shift, turn @ self.shot.axis
+    def seam_in_base(self) -> SeamFrame:
+        """The seam's frame, in base."""
+        return self.shot.seam.moved(self.base_from_scanner)

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import Scanner, seam_fates
+from weldscan._weldcore import Scanner, SeamCourse, seam_fates
 from weldscan.measure.part_views import PartView
 from weldscan.result import FATES, Coverage, Finding, SeamBin, bar
 
 Floats = NDArray[np.float64]
 
-BINS, BIN_DEG = 180, 2.0
 # Beyond this angle between a surface and the rays of camera or projector nobody is surprised to see no fringes.
 STEEPEST_DEG = 50.0
 # Of the ends of all views, from the gentlest: some may end early for the very reason that a gap is looked for. And what
@@ -45,10 +44,12 @@ POINTS = [INDEX[name] for name in ("wall", "transition", "cap", "gated", "off_li
 class EdgeProfile:
     """The edge step by bin: how far the surfaces right beside the toes are apart."""
 
+    course: SeamCourse
+    """Whose bins these are."""
     step_mm: Floats
-    """(180,), NaN where it was not read."""
+    """(bins,), NaN where it was not read."""
     u_mm: Floats
-    """(180,), expanded, k = 2, with what the choice of the toes may hide in full."""
+    """(bins,), expanded, k = 2, with what the choice of the toes may hide in full."""
     confirmed_mm: float
     """The largest |step| - U that two neighbouring stations share: a single one may be a drop of spatter."""
 
@@ -74,17 +75,18 @@ class EdgeProfile:
         """
         off = np.abs(self.step_mm[bins] - wall_mm) - (CONTRADICTION * np.hypot(self.u_mm[bins], wall_u_mm))
         beyond = set(bins[off > 0].tolist())
-        return any((k + 1) % BINS in beyond for k in beyond)
+        return any(self.course.beyond(k, 1) in beyond for k in beyond)
 
 
 def edge_profile(views: Sequence[PartView]) -> EdgeProfile:
     """The edge step of all shots: in each bin by the shot that tells it best, there the reading furthest from zero.
 
     Args:
-        views: the segmented part shots.
+        views: the segmented part shots, one at least.
     """
-    best_u = np.full(BINS, np.inf)
-    step, u = np.full(BINS, np.nan), np.full(BINS, np.nan)
+    course = views[0].shot.seam.course
+    best_u = np.full(course.bins, np.inf)
+    step, u = np.full(course.bins, np.nan), np.full(course.bins, np.nan)
     confirmed = 0.0
     for view in views:
         sections = view.shot.sections
@@ -104,7 +106,7 @@ def edge_profile(views: Sequence[PartView]) -> EdgeProfile:
                 # The worst of several is further off than any single one's uncertainty says.
                 chosen = abs(float(read[worst] - np.median(read[known])))
                 best_u[k], step[k], u[k] = typical, read[worst], expanded[worst] + chosen
-    return EdgeProfile(step, u, confirmed)
+    return EdgeProfile(course, step, u, confirmed)
 
 
 def _shared(read: Floats, expanded: Floats) -> tuple[Floats, Floats]:
@@ -124,20 +126,19 @@ def _shared(read: Floats, expanded: Floats) -> tuple[Floats, Floats]:
 
 def _stations_by_bin(view: PartView) -> dict[int, NDArray[np.intp]]:
     """The stations that reach into each bin."""
-    shot = view.shot
-    angles = shot.sections["angle_deg"]
-    half = BIN_DEG / 2 + math.degrees(shot.station_mm / 2 / shot.radius_mm)
+    shot, course = view.shot, view.shot.seam.course
+    readings = shot.sections["along"]
+    half = course.bin_width / 2 + course.reading_of_mm(shot.station_mm / 2)
     found = {}
-    for k in range(BINS):
-        off = (angles - BIN_DEG * k + 180) % 360 - 180
-        near = np.flatnonzero(np.abs(off) < half)
+    for k in range(course.bins):
+        near = np.flatnonzero(np.abs(course.apart(readings, course.bin_width * k)) < half)
         if len(near):
             found[k] = near
     return found
 
 
 def expected_bins(views: Sequence[PartView], scanner: Scanner) -> set[int]:
-    """The bins that these views should have seen, by poses, lenses and the pipe: whole, with the walls beside the weld,
+    """The bins that these views should have seen, by poses, lenses and the part: whole, with the walls beside the weld,
     in both images, and not steeper to either ray than what these views measure elsewhere.
     """
     fields = [field for view in views if (field := _field(view, scanner)) is not None]
@@ -149,19 +150,18 @@ def expected_bins(views: Sequence[PartView], scanner: Scanner) -> set[int]:
 
 def _field(view: PartView, scanner: Scanner) -> tuple[NDArray[np.bool_], Floats] | None:
     """Per bin: whether it lies in both images, and the angle between its surface and the steeper ray, degrees."""
-    shot = view.shot
+    shot, seam, course = view.shot, view.shot.seam, view.shot.seam.course
     toes = shot.sections["toes_mm"]
     if np.isnan(toes).all():
         return None
     low, high = np.nanmedian(toes[:, 0]) - BESIDE_MM, np.nanmedian(toes[:, 1]) + BESIDE_MM
-    margin = BIN_DEG / 2 + math.degrees(shot.station_mm / shot.radius_mm)
-    square = np.cross(shot.axis, shot.zero)
-    inside, steep = np.ones(BINS, bool), np.zeros(BINS)
+    margin = course.bin_width / 2 + course.reading_of_mm(shot.station_mm)
+    inside, steep = np.ones(course.bins, bool), np.zeros(course.bins)
     for off in (-margin, 0.0, margin):
-        angle = np.radians(BIN_DEG * np.arange(BINS) + off)[:, None]
-        normal = np.cos(angle) * shot.zero + np.sin(angle) * square
-        for along in (low, 0.0, high):
-            points = shot.origin_mm + shot.axis * along + normal * shot.radius_mm
+        at = np.array([course.at(course.bin_width * k + off) for k in range(course.bins)])
+        normal = seam.outward(at)
+        for across in (low, 0.0, high):
+            points = seam.points(at, np.full(course.bins, across))
             inside &= points[:, 2] > 0
             for pixels, lens in (
                 (scanner.camera.project(points), scanner.camera),
@@ -182,12 +182,14 @@ def _ends(view: PartView, inside: NDArray[np.bool_], steep: Floats) -> list[floa
     seen = {k for k, stations in _stations_by_bin(view).items() if read[stations].any() and inside[k]}
     if not seen:
         return []
+    course = view.shot.seam.course
     middle = min(seen, key=lambda k: steep[k])
+    away = course.apart(course.bin_width * np.array(sorted(seen)), course.bin_width * middle)
     ends = []
     for way in (-1, 1):
-        end = max((way * ((k - middle + BINS // 2) % BINS - BINS // 2) for k in seen), default=0)
-        last, beyond = (middle + way * end) % BINS, (middle + way * (end + 1)) % BINS
-        if end > 0 and inside[beyond]:
+        end = round(float((way * away).max()) / course.bin_width)
+        last, beyond = course.beyond(middle, way * end), course.beyond(middle, way * (end + 1))
+        if end > 0 and last is not None and beyond is not None and inside[beyond]:
             ends.append(float(steep[last]))
     return ends
 
@@ -199,13 +201,14 @@ def _beside_read(views: Sequence[PartView], near: Sequence[NDArray[np.uint32]]) 
     """
     found: set[int] = set()
     for view, table in zip(views, near, strict=True):
-        shot = view.shot
-        reach_deg = REACH_STATIONS * math.degrees(shot.station_mm / shot.radius_mm)
-        read = shot.sections["angle_deg"][np.isfinite(shot.sections["edge_step_mm"])]
+        shot, course = view.shot, view.shot.seam.course
+        reach = REACH_STATIONS * course.reading_of_mm(shot.station_mm)
+        read = shot.sections["along"][np.isfinite(shot.sections["edge_step_mm"])]
         sampled = _lost(table) <= LOST_PART
         for at in read.tolist():
-            first, last = math.ceil((at - reach_deg) / BIN_DEG), math.floor((at + reach_deg) / BIN_DEG)
-            found.update(k % BINS for k in range(first, last + 1) if sampled[k % BINS])
+            first, last = math.ceil((at - reach) / course.bin_width), math.floor((at + reach) / course.bin_width)
+            near_it = (course.beyond(k, 0) for k in range(first, last + 1))
+            found.update(k for k in near_it if k is not None and sampled[k])
     return found
 
 
@@ -216,37 +219,42 @@ def _lost(near: NDArray[Any]) -> Floats:
     return np.where(total >= LEAST_PIXELS, share, np.inf)
 
 
-def coverage_of(measured: Iterable[int], expected: Iterable[int], required_deg: float | None, by: str) -> Coverage:
+def coverage_of(
+    course: SeamCourse, measured: Iterable[int], expected: Iterable[int], required: float | None, by: str
+) -> Coverage:
     """How much was seen of what had to be.
 
     Args:
+        course: of the seam, whose bins these are.
         measured: bins with a step.
         expected: bins that the views should have seen.
-        required_deg: of the session or the option; None: what was expected.
+        required: of the session or the option, as a difference of readings; None: what was expected.
         by: session, option or views.
     """
     seen, wanted = set(measured), set(expected)
-    seen_deg = BIN_DEG * len(seen)
-    if required_deg is None:
-        return Coverage(seen_deg, BIN_DEG * len(wanted), by, _arcs(wanted - seen))
+    seen_length = course.bin_width * len(seen)
+    if required is None:
+        return Coverage(seen_length, course.bin_width * len(wanted), by, _stretches(course, wanted - seen))
     missing = wanted - seen
-    if seen_deg < required_deg:
-        missing = set(range(BINS)) - seen
-    return Coverage(seen_deg, required_deg, by, _arcs(missing))
+    if seen_length < required:
+        missing = set(range(course.bins)) - seen
+    return Coverage(seen_length, required, by, _stretches(course, missing))
 
 
-def _arcs(bins: set[int]) -> tuple[tuple[float, float], ...]:
-    """Runs of bins as arcs, in [0, 360), from and to in the direction of growing angle."""
-    if len(bins) >= BINS:
-        return ((0.0, 360.0),)
-    starts = [k for k in sorted(bins) if (k - 1) % BINS not in bins]
-    arcs = []
-    for start in starts:
+def _stretches(course: SeamCourse, bins: set[int]) -> tuple[tuple[float, float], ...]:
+    """Runs of bins as stretches of the seam: the readings of their ends, in the direction in which readings grow."""
+    if course.turn is not None and len(bins) >= course.bins:
+        return ((0.0, course.turn),)
+    width = course.bin_width
+    found = []
+    for start in sorted(bins):
+        if course.beyond(start, -1) in bins:
+            continue
         end = start
-        while (end + 1) % BINS in bins:
-            end = (end + 1) % BINS
-        arcs.append((float((BIN_DEG * start - BIN_DEG / 2) % 360), float((BIN_DEG * end + BIN_DEG / 2) % 360)))
-    return tuple(arcs)
+        while (following := course.beyond(end, 1)) is not None and following in bins:
+            end = following
+        found.append((course.told(width * start - width / 2), course.told(width * end + width / 2)))
+    return tuple(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,8 +270,8 @@ def seam_of(
     views: Sequence[PartView],
     scanner: Scanner,
     measured: Iterable[int],
-    radius_mm: float,
-    required_deg: float | None = None,
+    nominal: SeamCourse,
+    required: float | None = None,
     required_by: str = "views",
 ) -> Seam:
     """The fates of all pixels by bin, the coverage, and the bars that follow from them and from the cross-sections.
@@ -271,37 +279,38 @@ def seam_of(
     Args:
         views: the segmented part shots.
         scanner: that took them.
-        measured: bins of 2 degrees with a step.
-        radius_mm: of the pipe, nominal.
-        required_deg: least coverage, where session or option ask for one.
+        measured: bins with a step.
+        nominal: how the seam runs, by the part's rated size: lengths along it are counted on that.
+        required: least coverage, as a difference of readings, where session or option ask for one.
         required_by: session, option or views.
     """
-    measured = set(measured)
+    measured, course = set(measured), views[0].shot.seam.course
     tables = [seam_fates(view.shot, np.ascontiguousarray(view.reason), scanner) for view in views]
-    every: NDArray[np.int64] = np.zeros((BINS, len(FATES)), np.int64)
-    for whole, _ in tables:
-        every += whole
+    every: NDArray[np.int64] = np.zeros((course.bins, len(FATES)), np.int64)
+    for table, _ in tables:
+        every += table
     expected = expected_bins(views, scanner)
     beside = _beside_read(views, [near for _, near in tables]) & expected
-    coverage = coverage_of(measured | beside, expected, required_deg, required_by)
-    wanted = set(range(BINS)) if coverage.required_deg >= 360 else expected
+    coverage = coverage_of(course, measured | beside, expected, required, required_by)
+    whole = course.turn is not None and coverage.required_deg >= course.turn
+    wanted = set(range(course.bins)) if whole else expected
     caps = _caps(views)
     bins = tuple(
         SeamBin(
-            angle_deg=BIN_DEG * k,
-            along_mm=math.radians(BIN_DEG * k) * radius_mm,
+            angle_deg=course.bin_width * k,
+            along_mm=nominal.along_mm(nominal.at(course.bin_width * k)),
             measured=k in measured,
             fate=dict(zip(FATES, every[k].tolist(), strict=True)),
             cap_width_mm=caps[k][1] - caps[k][0] if k in caps else None,
             toes_mm=caps.get(k),
         )
-        for k in range(BINS)
+        for k in range(course.bins)
         if k in wanted or k in measured or every[k][POINTS].sum() >= LEAST_PIXELS
     )
-    findings = [*_of_coverage(coverage)]
-    for view, (whole, near) in zip(views, tables, strict=True):
-        findings += _of_fates(view, whole, near, measured | expected)
-        findings += [bar(code, text, view.name, angle) for code, angle, text in view.shot.doubts]
+    findings = [*_of_coverage(course, coverage)]
+    for view, (table, near) in zip(views, tables, strict=True):
+        findings += _of_fates(view, table, near, measured | expected)
+        findings += [bar(code, text, view.name, along) for code, along, text in view.shot.doubts]
     findings += _of_lost(views, [near for _, near in tables], measured | expected, expected)
     return Seam(bins, coverage, tuple(findings))
 
@@ -320,33 +329,36 @@ def _caps(views: Sequence[PartView]) -> Mapping[int, tuple[float, float]]:
     return found
 
 
-def _of_coverage(coverage: Coverage) -> list[Finding]:
+def _of_coverage(course: SeamCourse, coverage: Coverage) -> list[Finding]:
     if coverage.enough:
         return []
-    arcs = ", ".join(f"{a:.0f}° to {b:.0f}°" for a, b in coverage.gaps[:4]) + (" ..." if len(coverage.gaps) > 4 else "")
+    unit = course.unit
+    gaps = ", ".join(f"{a:.0f}{unit} to {b:.0f}{unit}" for a, b in coverage.gaps[:4]) + (
+        " ..." if len(coverage.gaps) > 4 else ""
+    )
     why = {"session": "the session asks for", "option": "--require-coverage asks for"}.get(
         coverage.required_by, "these views should have seen"
     )
-    at = (coverage.gaps[0][0] + BIN_DEG / 2) % 360 if coverage.gaps else None
-    text = f"{coverage.seen_deg:.0f}° of the seam were seen, {why} {coverage.required_deg:.0f}°"
-    return [bar("coverage", f"{text}: nothing is known of {arcs}" if arcs else text, None, at)]
+    at = course.told(coverage.gaps[0][0] + course.bin_width / 2) if coverage.gaps else None
+    text = f"{coverage.seen_deg:.0f}{unit} of the seam were seen, {why} {coverage.required_deg:.0f}{unit}"
+    return [bar("coverage", f"{text}: nothing is known of {gaps}" if gaps else text, None, at)]
 
 
 def _of_fates(view: PartView, whole: NDArray[np.uint32], near: NDArray[np.uint32], judged: set[int]) -> list[Finding]:
     """Bars for one shot: points that no wall took, in the bins that are judged or should be."""
-    findings = []
+    findings, course = [], view.shot.seam.course
     # Where the points are too few for a station (a hole, the corner of a leaning view), nothing was to be recognised:
     # another view tells what is there, or it is a gap of the coverage.
     seen = view.shot.sections["seen"] != 0
     judged = judged & {k for k, stations in _stations_by_bin(view).items() if seen[stations].any()}
-    of_seam = np.isin(np.arange(BINS), list(judged))
+    of_seam = np.isin(np.arange(course.bins), list(judged))
     for table, where in ((near, "at the weld"), (whole, "of the view")):
         points, odd = table[:, POINTS].sum(axis=1), table[:, UNEXPLAINED].sum(axis=1)
         share = np.where(of_seam & (points >= LEAST_PIXELS), odd / np.maximum(points, 1), 0.0)
         if (share > UNEXPLAINED_PART).any():
             k = int(np.argmax(share))
             text = f"{odd[k]} of {points[k]} points {where} belong neither to a wall nor to the cap: what are they?"
-            findings.append(bar("points-without-wall", text, view.name, BIN_DEG * k))
+            findings.append(bar("points-without-wall", text, view.name, course.bin_width * k))
             break
     return findings
 
@@ -359,8 +371,10 @@ def _of_lost(
     """
     if not len(near):
         return []
-    of_seam, in_view = (np.isin(np.arange(BINS), list(bins)) for bins in (judged, expected))
-    run = max(math.ceil(2 * math.degrees(view.shot.station_mm / view.shot.radius_mm) / BIN_DEG) for view in views)
+    course = views[0].shot.seam.course
+    of_seam, in_view = (np.isin(np.arange(course.bins), list(bins)) for bins in (judged, expected))
+    stations = [view.shot.seam.course.reading_of_mm(view.shot.station_mm) for view in views]
+    run = max(math.ceil(2 * station / course.bin_width) for station in stations)
     table = np.stack(near)
     total = table.sum(axis=2)
     lost = _lost(table)
@@ -376,11 +390,12 @@ def _of_lost(
     )
     for name, code, part, bins, text in rules:
         share = np.where(bins & np.isfinite(best[name]), best[name], 0.0)
-        lasting = np.min([np.roll(share, -off) for off in range(run)], axis=0)
+        ahead = ([course.beyond(k, off) for k in range(course.bins)] for off in range(run))
+        lasting = np.min([[0.0 if k is None else share[k] for k in bins] for bins in ahead], axis=0)
         if lasting.max() > part:
             k = int(np.argmax(lasting))
             view = views[int(np.argmin(shares[name][:, k]))].name
             said = f"{100 * share[k]:.0f} % of the pixels at the weld were {text}"
-            findings.append(bar(code, said, view, BIN_DEG * k))
+            findings.append(bar(code, said, view, course.bin_width * k))
             break
     return findings

@@ -22,12 +22,12 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import measure_step, wall_differences, wall_seen
+from weldscan._weldcore import SeamCourse, SeamFrame, measure_step, wall_differences, wall_seen
 from weldscan.calibration.hand_eye import LARGEST_RESIDUAL_MM, pose_sigma
 from weldscan.errors import GeometryError
 from weldscan.geometry import skew
 from weldscan.measure.part_views import PartView
-from weldscan.measure.seam_coverage import BIN_DEG, BINS, edge_profile
+from weldscan.measure.seam_coverage import edge_profile
 from weldscan.result import Finding, HandEye, Label, PartCloud, Severity, ShotAgreement, bar, warning
 
 Floats = NDArray[np.float64]
@@ -61,8 +61,8 @@ SIGMAS = 3.0
 STEP_SLACK_MM = 0.2
 # Below that, from here on, it is worth a warning: waves of the walls.
 STEP_WARNING_MM = 0.1
-# A bin may be this many degrees off: an oval pipe moves the centre about which a shot counts angles.
-STEP_SHIFT_DEG = 2
+# A bin may be so many bins off: an oval pipe moves the centre about which a shot counts its places.
+STEP_SHIFT_BINS = 1
 LEAST_BINS = 2
 # So many disagreements are listed; more only repeat them.
 MOST_SAID = 6
@@ -79,26 +79,24 @@ class PlacedShot:
 
 
 def agreement(
-    cloud: PartCloud, shots: Sequence[PlacedShot], hand_eye: HandEye, origin_mm: Floats, axis: Floats
+    cloud: PartCloud, shots: Sequence[PlacedShot], hand_eye: HandEye, seam: SeamFrame
 ) -> tuple[ShotAgreement, ...]:
-    """The radial difference between every two shots where both saw a wall, with its uncertainty.
+    """The difference in height between every two shots where both saw a wall, with its uncertainty.
 
     Args:
         cloud: all points in base.
         shots: of the cloud.
         hand_eye: through which they were placed.
-        origin_mm: (3,), a point of the pipe's axis in base.
-        axis: (3,), its direction.
+        seam: of one of them, in base.
 
     Returns:
         One per pair that saw a wall together in 20 cells of 4 mm or more.
     """
-    axis = axis / np.linalg.norm(axis)
+    origin_mm, axis = seam.origin_mm, seam.across
     found = []
     pairs = wall_differences(cloud.points_mm, cloud.label, cloud.shot, [shot.index for shot in shots], origin_mm, axis)
     for i, j, cells, difference_mm, scatter_mm, rms_mm, middle in pairs:
-        radial = middle - origin_mm - axis * (axis @ (middle - origin_mm))
-        normal = radial / np.linalg.norm(radial)
+        normal = seam.outward(seam.place(middle[None])[0])[0]
         placing = _placing_mm([shots[i], shots[j]], hand_eye, middle, normal)
         found.append(
             ShotAgreement(
@@ -196,23 +194,20 @@ class _Seen:
 
     @classmethod
     def of(cls, view: PartView) -> _Seen:
-        shot, turn = view.shot, view.base_from_scanner[:3, :3]
-        origin, axis = view.axis_in_base
+        shot, seam = view.shot, view.seam_in_base
+        axis = seam.across
         seen = wall_seen(shot)
         if seen is None:
             raise GeometryError(f"{view.name}: no point of it lies on the reference wall")
         middle, half, twist, left = seen
-        zero = turn @ shot.zero
-        zero = zero - axis * (axis @ zero)
-        zero /= np.linalg.norm(zero)
-        outward = math.cos(middle) * zero + math.sin(middle) * np.cross(axis, zero)
-        across = np.cross(axis, outward)
-        # The axis leans towards the view, or turns across it: then the wall is twisted by along * sin(angle) only.
+        outward = seam.outward([middle])[0]
+        along = np.cross(axis, outward)
+        # The axis leans towards the view, or turns across it: then the wall is twisted by across * sin(angle) only.
         waves = max(UNEVENNESS_MM, FLATTENED * left)
         sideways = math.hypot(WALL_LEAN_RAD, waves / max(twist, 1e-3))
-        covariance = WALL_LEAN_RAD**2 * np.outer(outward, outward) + sideways**2 * np.outer(across, across)
+        covariance = WALL_LEAN_RAD**2 * np.outer(outward, outward) + sideways**2 * np.outer(along, along)
         centre = waves / max(1 - math.cos(half), 1e-4)
-        return cls(view, axis, origin + shot.radius_mm * outward, outward, covariance, centre)
+        return cls(view, axis, seam.points([middle], [0.0])[0], outward, covariance, centre)
 
 
 def _about_places(views: Sequence[PartView], misplaced: Mapping[tuple[int, int], Sequence[str]]) -> list[Finding]:
@@ -290,12 +285,12 @@ def _turning_rad(hand_eye: HandEye) -> float:
 
 
 def _stepped_alike(views: Sequence[PartView], hand_eye: HandEye, not_these: set[tuple[int, int]]) -> list[Finding]:
-    """The step of each shot alone, bin by bin, where two of them saw the seam; but for pairs whose angles are wrong."""
-    degrees = [_bins_seen(view) for view in views]
+    """The step of each shot alone, bin by bin, where two of them saw the seam; but for pairs whose places are wrong."""
+    seen = [_bins_seen(view) for view in views]
     pairs = [
         (i, j)
         for i, j in combinations(range(len(views)), 2)
-        if len(degrees[i] & degrees[j]) >= LEAST_BINS and (i, j) not in not_these
+        if len(seen[i] & seen[j]) >= LEAST_BINS and (i, j) not in not_these
     ]
     alone: dict[int, dict[int, tuple[float, float]]] = {}
     for k in sorted({k for pair in pairs for k in pair}):
@@ -305,19 +300,21 @@ def _stepped_alike(views: Sequence[PartView], hand_eye: HandEye, not_these: set[
             continue
         columns = step["profile_columns"]
         angle, value, sigma = (columns.index(name) for name in ("angle_deg", "step_mm", "standard_mm"))
-        alone[k] = {round(row[angle]) % 360: (float(row[value]), float(row[sigma])) for row in step["profile"]}
+        course = views[k].shot.seam.course
+        alone[k] = {
+            round(row[angle] / course.bin_width): (float(row[value]), float(row[sigma])) for row in step["profile"]
+        }
     found = []
     for i, j in pairs:
         if i in alone and j in alone:
-            bounds = _of_edges(views[i], views[j])
-            found += list(_unlike(views[i].name, views[j].name, alone[i], alone[j], *bounds))
+            bounds, course = _of_edges(views[i], views[j]), views[i].shot.seam.course
+            found += list(_unlike(views[i].name, views[j].name, course, alone[i], alone[j], *bounds))
     return sorted(found, key=lambda finding: finding.severity is not Severity.BAR)[:MOST_SAID]
 
 
 def _bins_seen(view: PartView) -> set[int]:
     walls = (view.shot.labels == Label.REFERENCE_WALL) | (view.shot.labels == Label.OTHER_WALL)
-    angle = np.degrees(view.shot.angle_rad[walls][::50])
-    return set((2 * np.rint(angle / 2) % 360).astype(int).tolist())
+    return set(view.shot.seam.course.bins_of(view.shot.angle_rad[walls][::50].astype(np.float64)).tolist())
 
 
 def _of_edges(one: PartView, other: PartView) -> tuple[Floats, Floats]:
@@ -326,50 +323,48 @@ def _of_edges(one: PartView, other: PartView) -> tuple[Floats, Floats]:
     return np.abs(edges[0].step_mm - edges[1].step_mm), np.hypot(edges[0].u_mm, edges[1].u_mm)
 
 
-NOTHING: Floats = np.full(BINS, np.nan)
-
-
 def _unlike(
     one: str,
     other: str,
+    course: SeamCourse,
     a: Mapping[int, tuple[float, float]],
     b: Mapping[int, tuple[float, float]],
-    apart_mm: Floats = NOTHING,
-    open_mm: Floats = NOTHING,
+    apart_mm: Floats | None = None,
+    open_mm: Floats | None = None,
 ) -> Iterator[Finding]:
     """Where two profiles of the walls differ by more than their uncertainty in bins beside each other.
 
     A bar; but a warning where the surfaces right beside the weld, which are judged as well, are alike there: then one
-    shot misread a wall, at the end of its arc say.
+    shot misread a wall, at the end of its arc say. Profiles by bin of `course`; edges of all bins, NaN where unread.
     """
+    unread: Floats = np.full(course.bins, np.nan)
+    apart_mm, open_mm = unread if apart_mm is None else apart_mm, unread if open_mm is None else open_mm
     excess = {}
-    for at, (step, sigma) in a.items():
-        near = [b[turn] for d in range(-STEP_SHIFT_DEG, STEP_SHIFT_DEG + 1, 2) if (turn := (at + d) % 360) in b]
-        if at in b:
+    for k, (step, sigma) in a.items():
+        shifted = (course.beyond(k, shift) for shift in range(-STEP_SHIFT_BINS, STEP_SHIFT_BINS + 1))
+        near = [b[j] for j in shifted if j is not None and j in b]
+        if k in b:
             low, high = min(h for h, _ in near), max(h for h, _ in near)
             off = max(0.0, low - step, step - high)
-            beyond_mm = off - SIGMAS * math.hypot(sigma, b[at][1])
-            k = int(at // BIN_DEG)
+            beyond_mm = off - SIGMAS * math.hypot(sigma, b[k][1])
             alike = apart_mm[k] <= open_mm[k] + STEP_WARNING_MM and apart_mm[k] + open_mm[k] < beyond_mm
-            excess[at] = min(beyond_mm, STEP_SLACK_MM) if alike else beyond_mm
+            excess[k] = min(beyond_mm, STEP_SLACK_MM) if alike else beyond_mm
     for slack, severe in ((STEP_SLACK_MM, True), (STEP_WARNING_MM, False)):
-        beyond = {at for at, off in excess.items() if off > slack}
-        worst = max((at for at in beyond if (at + 2) % 360 in beyond or (at - 2) % 360 in beyond), default=None,
-                    key=lambda at: excess[at])  # fmt: skip
+        beyond = {k for k, off in excess.items() if off > slack}
+        lasting = [k for k in sorted(beyond) if course.beyond(k, 1) in beyond or course.beyond(k, -1) in beyond]
+        worst = max(lasting, default=None, key=lambda k: excess[k])
         if worst is None:
             continue
-        (h, u), (g, v) = a[worst], b[worst]
+        (h, u), (g, v), at = a[worst], b[worst], course.bin_width * worst
         text = (
-            f"{one} and {other} contradict each other on the step where both saw the seam: at {worst} "
+            f"{one} and {other} contradict each other on the step where both saw the seam: at {at:.0f} "
             f"degrees {h:.3f} ± {2 * u:.3f} mm in {one}, {g:.3f} ± {2 * v:.3f} mm in {other}, in "
             f"{len(beyond)} bins"
         )
         if severe:
-            yield bar(
-                "shots-disagree", f"{text}: are they of one weld, was a wall misread in one?", other, float(worst)
-            )
+            yield bar("shots-disagree", f"{text}: are they of one weld, was a wall misread in one?", other, at)
         else:
-            yield warning("agreement", text, other, float(worst))
+            yield warning("agreement", text, other, at)
         return
 
 

@@ -311,7 +311,7 @@ def _measures(seen_mm: float, told_mm: float) -> str:
 
 def _axis(views: Sequence[PartView], axis: Sequence[float], zero: Sequence[float], robot: bool) -> Iterator[Finding]:
     told, mark = (np.asarray(v, dtype=np.float64) / np.linalg.norm(v) for v in (axis, zero))
-    seen = np.mean([view.axis_in_base[1] for view in views], axis=0)
+    seen = np.mean([view.seam_in_base.across for view in views], axis=0)
     seen /= np.linalg.norm(seen)
     off = _angle_deg(told, seen)
     if off > AXIS_WARNING_DEG:
@@ -340,13 +340,12 @@ def _seam(view: PartView, part: PartSpec) -> Iterator[Finding]:
     bead = np.flatnonzero(shot.labels == Label.BEAD)
     if len(bead) < 100:
         return
-    # Angles about the bead's own middle, so that none of them jumps by a turn.
-    angle = shot.angle_rad[bead].astype(np.float64)
-    middle = math.atan2(float(np.sin(angle).mean()), float(np.cos(angle).mean()))
-    around = (np.angle(np.exp(1j * (angle - middle)))) * shot.radius_mm
-    slices = np.array_split(np.argsort(around), 12)
-    along = shot.axial_mm[bead].astype(np.float64)
-    at, place = (np.array([float(np.median(values[one])) for one in slices]) for values in (around, along))
+    course, at = shot.seam.course, shot.angle_rad[bead].astype(np.float64)
+    # From the bead's own middle, so that none of it jumps by a turn.
+    along = course.along_mm(1.0) * course.places_apart(at, course.middle(at))
+    slices = np.array_split(np.argsort(along), 12)
+    across = shot.axial_mm[bead].astype(np.float64)
+    at, place = (np.array([float(np.median(values[one])) for one in slices]) for values in (along, across))
     if np.ptp(at) < shot.bead_width_mm:
         return
     # The median slope of all pairs (Theil and Sen): a toe misread on a stretch of the arc is no inclined seam.

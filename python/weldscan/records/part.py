@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from weldscan._weldcore import SeamCourse
 from weldscan.records.fields import PARALLEL_SINE, Direction, Model, Positive
 
 
@@ -35,6 +37,11 @@ class PartSpec(Model):
     required_coverage_deg: Annotated[float, Field(gt=0, le=360)] | None = None
     """How much of the seam must be seen for a PASS; 360: all of it."""
 
+    @property
+    def course(self) -> SeamCourse:
+        """How its seam runs, by its rated size."""
+        return SeamCourse(self.outside_diameter / 2)
+
     @model_validator(mode="after")
     def _is_a_pipe(self) -> Self:
         for name in ("wall_thickness", "other_wall_thickness"):
@@ -51,3 +58,14 @@ class PartSpec(Model):
             absent = "axis_base" if self.axis_base is None else "zero_base"
             raise ValueError(f"{absent}: missing, while the other of axis_base and zero_base is given")
         return self
+
+
+def course_of(part: Mapping[str, Any]) -> SeamCourse | None:
+    """How the seam of a part runs, by its rated size as results keep it; None where no size is known.
+
+    >>> course = course_of({"outside_diameter": 400.0})
+    >>> round(course.along_mm(course.at(90.0)), 3)
+    314.159
+    """
+    diameter = part.get("outside_diameter")
+    return SeamCourse(diameter / 2) if diameter else None

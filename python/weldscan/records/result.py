@@ -15,6 +15,7 @@ import numpy as np
 from weldscan._weldcore import __version__
 from weldscan.errors import InputError
 from weldscan.records.files import is_earlier, plain, read_json
+from weldscan.records.part import course_of
 from weldscan.result import (
     FATES,
     ArtefactShot,
@@ -29,7 +30,6 @@ from weldscan.result import (
     Standing,
     StepResult,
     Verdict,
-    along_seam_mm,
 )
 
 SCHEMA = "weldscan-result/2"
@@ -170,8 +170,8 @@ def profile(step: StepResult | None, part: Mapping[str, Any]) -> list[dict[str, 
 
 
 def _along(angle_deg: float, part: Mapping[str, Any]) -> dict[str, float]:
-    along = along_seam_mm(angle_deg, part)
-    return {} if along is None else {"along_mm": along}
+    course = course_of(part)
+    return {} if course is None else {"along_mm": course.along_mm(course.at(course.told(angle_deg)))}
 
 
 def profile_csv(step: StepResult | None, part: Mapping[str, Any]) -> str:

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from weldscan._weldcore import __version__
+from weldscan._weldcore import SeamCourse, __version__
 from weldscan.records.files import to_json, whole_folder, write_synced
+from weldscan.records.part import course_of
 from weldscan.records.result import (
     CLASSES,
     FILES,
@@ -154,7 +155,7 @@ def html(inspection: Inspection, created: datetime) -> str:
     with ThreadPoolExecutor(2) as beside:
         # The pictures are drawn while the template is loaded and compiled.
         view = beside.submit(_view, inspection.cloud)
-        unrolled = beside.submit(_map, inspection.cloud, inspection.step)
+        unrolled = beside.submit(_map, inspection.cloud, inspection.step, _course(inspection))
         return _page(inspection, created, view, unrolled)
 
 
@@ -169,10 +170,13 @@ def _page(inspection: Inspection, created: datetime, view: Future[str | None], u
     guard = judged_u if judged_u is not None and math.isfinite(judged_u) else 0.0
     bars = _grouped(inspection.bars)
     marks = [charts.Mark(at, number) for number, group in enumerate(bars, 1) for at in group.places_deg]
+    course = _course(inspection)
     drawings: dict[str, Any] = dict.fromkeys(("step_chart", "clock", "map_chart", "histogram_chart"))
     if inspection.seam or (step is not None and step.measured.any()):
         limits = _limits(inspection.verdicts, guard)
-        drawings["step_chart"] = charts.seam_chart(step, limits, guard, inspection.seam, inspection.coverage, marks)
+        drawings["step_chart"] = charts.seam_chart(
+            step, limits, guard, inspection.seam, inspection.coverage, marks, course
+        )
         drawings["clock"] = charts.clock(step, inspection.seen_deg, inspection.seam, inspection.coverage, marks)
     if step is not None and step.histogram is not None:
         drawings["histogram_chart"] = charts.histogram_chart(step.histogram)
@@ -289,25 +293,32 @@ def part_line(part: Mapping[str, Any]) -> str:
 def _where(inspection: Inspection) -> str:
     if inspection.method == "paper" or inspection.step is None:
         return "by the paper's histogram"
-    return f"at {inspection.step.max_abs_at_deg:.0f}°"
+    return f"at {inspection.step.max_abs_at_deg:.0f}{_course(inspection).unit}"
 
 
 def _view(cloud: PartCloud | None) -> str | None:
     return None if cloud is None else pictures.cloud_view(cloud)
 
 
-def _map(cloud: PartCloud | None, step: StepResult | None) -> str | None:
+def _course(inspection: Inspection) -> SeamCourse:
+    return course_of(inspection.part) or charts.GIRTH
+
+
+def _map(cloud: PartCloud | None, step: StepResult | None, course: SeamCourse) -> str | None:
     if cloud is None or step is None or not cloud.label.size:
         return None
-    angles = np.flatnonzero(np.bincount((cloud.angle_deg * np.float32(0.5) + np.float32(0.5)).astype(np.intp))) * 2.0
-    arcs = charts.arcs_of(angles.tolist())
+    bins = np.rint(cloud.angle_deg / np.float32(course.bin_width)).astype(np.intp)
+    first = bins.min()
+    arcs = charts.arcs_of(
+        ((np.flatnonzero(np.bincount(bins - first)) + first) * course.bin_width).tolist(), course=course
+    )
     few = cloud.axial_mm[:: max(1, cloud.axial_mm.size // 20_000)]
     low, high = (float(value) for value in np.percentile(few, (0.2, 99.8)))
     # Up to the largest step, so that full colour is never less than what the verdict is about.
     scale = next(value for value in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, math.inf) if value >= 1.05 * step.max_abs_mm)
     scale = scale if math.isfinite(scale) else step.max_abs_mm
     extent = pictures.Extent(tuple(arcs), low, max(high, low + 1e-3))
-    return charts.map_chart(pictures.deviation_map(cloud, extent, scale), extent, scale)
+    return charts.map_chart(pictures.deviation_map(cloud, extent, scale), extent, scale, course)
 
 
 def _classes(cloud: PartCloud | None) -> list[tuple[str, str, int]]:

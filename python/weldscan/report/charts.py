@@ -9,13 +9,14 @@ from html import escape
 
 import numpy as np
 
+from weldscan._weldcore import SeamCourse
 from weldscan.report.pictures import Extent, diverging
 from weldscan.result import FATES, Coverage, Histogram, SeamBin, StepResult
 
 WIDTH = 960
 LEFT, RIGHT = 64, 24
 GAP = 26  # between two arcs of the seam
-BIN_DEG = 2.0  # of the profile and of the seam
+GIRTH = SeamCourse(1.0)  # what readings of a pipe's seam are, whatever its size
 
 
 def _short(value: object) -> str:
@@ -103,33 +104,36 @@ def number(value: float) -> str:
     return f"{value:g}".replace("-", "−")
 
 
-def arcs_of(
-    angles_deg: Sequence[float], bin_deg: float = BIN_DEG, bridge_deg: float = 8.0
-) -> list[tuple[float, float]]:
-    """The arcs that occupied bins make, (start, end) with an end perhaps beyond 360."""
-    # Gaps up to `bridge_deg` do not part an arc.
-    bins = np.unique(np.rint(np.mod(np.asarray(angles_deg, float), 360) / bin_deg).astype(int) % round(360 / bin_deg))
+def arcs_of(readings: Sequence[float], bridge: float = 8.0, course: SeamCourse = GIRTH) -> list[tuple[float, float]]:
+    """The stretches that occupied bins make, (start, end) with an end perhaps beyond a whole turn."""
+    # Gaps up to `bridge` do not part a stretch.
+    width = course.bin_width
+    at = np.asarray(readings, float)
+    bins = np.unique(np.rint((at if course.turn is None else np.mod(at, course.turn)) / width).astype(int))
+    if course.turn is not None:
+        bins = np.unique(bins % course.bins)
     if bins.size == 0:
         return []
-    whole = round(360 / bin_deg)
-    gaps = np.diff(np.append(bins, bins[0] + whole))
-    if gaps.max() * bin_deg <= bridge_deg:
-        return [(0.0, 360.0)]
-    # Begin after the widest gap, so that an arc across the zero mark stays in one piece.
-    first = int(np.argmax(gaps)) + 1
-    turned = np.concatenate([bins[first:], bins[:first] + whole])
-    cuts = np.flatnonzero(np.diff(turned) * bin_deg > bridge_deg)
-    starts, ends = np.append(0, cuts + 1), np.append(cuts, turned.size - 1)
-    arcs = [(float(turned[s]) * bin_deg, float(turned[e]) * bin_deg) for s, e in zip(starts, ends, strict=True)]
-    arcs = [(s - 360, e - 360) if s >= 360 else (s, e) for s, e in arcs]
-    return sorted((s - bin_deg / 2, e + bin_deg / 2) for s, e in arcs)
+    if course.turn is not None:
+        gaps = np.diff(np.append(bins, bins[0] + course.bins))
+        if gaps.max() * width <= bridge:
+            return [(0.0, course.turn)]
+        # Begin after the widest gap, so that a stretch across the zero mark stays in one piece.
+        first = int(np.argmax(gaps)) + 1
+        bins = np.concatenate([bins[first:], bins[:first] + course.bins])
+    cuts = np.flatnonzero(np.diff(bins) * width > bridge)
+    starts, ends = np.append(0, cuts + 1), np.append(cuts, bins.size - 1)
+    found = [(float(bins[s]) * width, float(bins[e]) * width) for s, e in zip(starts, ends, strict=True)]
+    if course.turn is not None:
+        found = [(s - course.turn, e - course.turn) if s >= course.turn else (s, e) for s, e in found]
+    return sorted((s - width / 2, e + width / 2) for s, e in found)
 
 
-class AngleAxis:
-    """Arcs side by side, at one scale: from an angle to a place on the page."""
+class AlongAxis:
+    """Stretches of the seam side by side, at one scale: from a reading to a place on the page."""
 
-    def __init__(self, arcs: Sequence[tuple[float, float]]) -> None:
-        self.arcs = list(arcs)
+    def __init__(self, arcs: Sequence[tuple[float, float]], course: SeamCourse = GIRTH) -> None:
+        self.arcs, self.course = list(arcs), course
         total = sum(end - start for start, end in arcs)
         self.scale = (WIDTH - LEFT - RIGHT - GAP * (len(self.arcs) - 1)) / total
         self.places: list[tuple[float, float]] = []
@@ -138,37 +142,41 @@ class AngleAxis:
             self.places.append((x, (end - start) * self.scale))
             x += (end - start) * self.scale + GAP
 
-    def __call__(self, angle_deg: float) -> tuple[int, float] | None:
-        """Which arc an angle lies in, and its x; None where it was not seen."""
+    def __call__(self, reading: float) -> tuple[int, float] | None:
+        """Which stretch a reading lies in, and its x; None where it was not seen."""
         for index, (start, end) in enumerate(self.arcs):
-            along = (angle_deg - start) % 360
-            if along <= end - start + 1e-6:
+            along = self.course.told(reading - start)
+            if 0 <= along <= end - start + 1e-6:
                 return index, self.places[index][0] + along * self.scale
         return None
 
-    def spans(self, start_deg: float, end_deg: float) -> Iterator[tuple[float, float]]:
-        """Where an arc, in the direction of growing angle, lies on the page: (x, width) of each piece."""
-        length = (end_deg - start_deg) % 360 or 360.0
+    def spans(self, first: float, last: float) -> Iterator[tuple[float, float]]:
+        """Where a stretch, in the direction in which readings grow, lies on the page: (x, width) of each piece."""
+        told, turn = self.course.told, self.course.turn
+        length, first = told(last - first) or (turn or 0.0), told(first)
         for (start, end), (x, _) in zip(self.arcs, self.places, strict=True):
-            for turn in (-360, 0, 360):
-                low = max(start, start_deg % 360 + turn)
-                high = min(end, start_deg % 360 + length + turn)
+            for off in (0.0,) if turn is None else (-turn, 0.0, turn):
+                low = max(start, first + off)
+                high = min(end, first + length + off)
                 if high > low + 1e-6:
                     yield x + (low - start) * self.scale, (high - low) * self.scale
 
-    def draw(self, svg: Svg, top: float, bottom: float, degrees: bool = True) -> None:
-        """Frames, grid lines and degrees below."""
+    def draw(self, svg: Svg, top: float, bottom: float, readings: bool = True) -> None:
+        """Frames, grid lines and readings below."""
+        course = self.course
         span = sum(end - start for start, end in self.arcs)
-        step = next(step for step in (2, 5, 10, 15, 30, 45, 60) if span / step <= 16)
+        steps = (2, 5, 10, 15, 30, 45, 60) if course.turn is not None else (2, 5, 10, 20, 50, 100, 200, 500, 1000)
+        step = next(step for step in steps if span / step <= 16 or step == steps[-1])
         for (start, end), (x, width) in zip(self.arcs, self.places, strict=True):
             svg.add("rect", x=x, y=float(top), width=width, height=float(bottom - top), class_="panel")
             for tick in range(math.ceil(start / step) * step, math.floor(end) + 1, step):
                 at = x + (tick - start) * self.scale
                 svg.line(at, top, at, bottom, "grid")
-                if degrees:
-                    svg.text(at, bottom + 17, f"{tick % 360 if tick != 360 else 360}°", "tick")
-        if degrees:
-            svg.text((LEFT + WIDTH - RIGHT) / 2, bottom + 37, "angle about the pipe's axis, from the zero mark", "axis")
+                if readings:
+                    told = tick if tick == course.turn else course.told(tick)
+                    svg.text(at, bottom + 17, f"{told:.0f}{course.unit}", "tick")
+        if readings:
+            svg.text((LEFT + WIDTH - RIGHT) / 2, bottom + 37, course.label, "axis")
 
 
 @dataclass(frozen=True)
@@ -194,13 +202,15 @@ def seam_chart(
     seam: Sequence[SeamBin] = (),
     coverage: Coverage | None = None,
     marks: Sequence[Mark] = (),
+    course: SeamCourse = GIRTH,
 ) -> str:
-    """Step over angle with its uncertainty and every limit; below it, to the same scale, what became of the pixels.
+    """Step along the seam with its uncertainty and every limit; below it, to the same scale, what became of the pixels.
 
     What was required and not seen is hatched, and no line runs across it; what bars the verdict is a red column.
     """
     known = [] if step is None else step.angle_deg[step.measured].tolist()
-    angles = AngleAxis(arcs_of([*known, *(each.angle_deg for each in seam)]))
+    along = AlongAxis(arcs_of([*known, *(each.angle_deg for each in seam)], course=course), course)
+    width_of_bin = course.bin_width
     top, bottom = 26, 330 if known else 26
     strip = (bottom + (12 if known else 0), bottom + (64 if known else 60)) if seam else None
     end = strip[1] if strip else bottom
@@ -212,19 +222,19 @@ def seam_chart(
     )
     panels = [(top, bottom)] if known else []
     if known:
-        angles.draw(svg, top, bottom, degrees=strip is None)
+        along.draw(svg, top, bottom, readings=strip is None)
     if strip:
-        angles.draw(svg, *strip)
-        _draw_fates(svg, angles, seam, *strip)
+        along.draw(svg, *strip)
+        _draw_fates(svg, along, seam, *strip)
         panels.append(strip)
-    for arc in unseen_arcs(seam, coverage) if known else ():
-        for x, width in angles.spans(*arc):
+    for arc in unseen_arcs(seam, coverage, course) if known else ():
+        for x, width in along.spans(*arc):
             svg.add("rect", x=x, y=float(top), width=width, height=float(bottom - top), fill="url(#unseen)")
             if width > 60:
                 svg.text(x + width / 2, (top + bottom) / 2, "not seen", "unseen-label")
     for upper, lower in panels:
         for mark in marks:
-            for x, width in angles.spans(mark.at_deg - BIN_DEG / 2, mark.at_deg + BIN_DEG / 2):
+            for x, width in along.spans(mark.at_deg - width_of_bin / 2, mark.at_deg + width_of_bin / 2):
                 wide = max(width, 5.0)
                 svg.add(
                     "rect",
@@ -235,16 +245,16 @@ def seam_chart(
                     class_="bar-column",
                 )
     if step is not None and known:
-        _draw_step(svg, angles, step, limits, guard_mm, top, bottom)
-    _draw_numbers(svg, angles, marks, top - 6)
+        _draw_step(svg, along, step, limits, guard_mm, top, bottom)
+    _draw_numbers(svg, along, marks, top - 6)
     return str(svg)
 
 
 def _draw_step(
-    svg: Svg, angles: AngleAxis, step: StepResult, limits: Sequence[Limit], guard_mm: float, top: float, bottom: float
+    svg: Svg, along: AlongAxis, step: StepResult, limits: Sequence[Limit], guard_mm: float, top: float, bottom: float
 ) -> None:
     some = step.measured
-    angle, value, u = step.angle_deg[some], step.step_mm[some], step.u_mm[some]
+    reading, value, u = step.angle_deg[some], step.step_mm[some], step.u_mm[some]
     highest, lowest = max(float((value + u).max()), 0.0), min(float((value - u).min()), 0.0)
     if limits:
         # The side towards which the step leans shows every limit; the other one where the step comes near it.
@@ -275,7 +285,7 @@ def _draw_step(
         side, anchor = (WIDTH - RIGHT - 8, "end") if right else (LEFT + 8, "start")
         svg.text(side, y(at) - 5, each.label, "limit-label", anchor)
 
-    for run in _runs(angles, angle.tolist(), value.tolist(), u.tolist()):
+    for run in _runs(along, reading.tolist(), value.tolist(), u.tolist()):
         if len(run) == 1:
             x, v, half = run[0]
             svg.line(x, y(v + half), x, y(v - half), "whisker")
@@ -285,27 +295,27 @@ def _draw_step(
             svg.path([(x, y(v)) for x, v, _ in run], "curve")
         for x, v, _ in run:
             svg.add("circle", cx=x, cy=y(v), r=2.4, class_="dot")
-    place = angles(step.max_abs_at_deg)
+    place = along(step.max_abs_at_deg)
     if place is not None:
-        index = int(np.argmin(np.abs((angle - step.max_abs_at_deg + 180) % 360 - 180)))
+        index = int(np.argmin(np.abs(along.course.apart(reading, step.max_abs_at_deg))))
         x, middle = place[1], y(float(value[index]))
         anchor, aside = ("end", -9) if x > WIDTH * 0.75 else ("start", 9)
         svg.add("circle", cx=x, cy=middle, r=5.5, class_="mark")
-        said = f"largest {step.max_abs_mm:.3f} mm at {step.max_abs_at_deg:.0f}°"
+        said = f"largest {step.max_abs_mm:.3f} mm at {step.max_abs_at_deg:.0f}{along.course.unit}"
         svg.text(x + aside, middle - 10, said, "mark-label", anchor)
 
 
 def _runs(
-    angles: AngleAxis, angle: Sequence[float], value: Sequence[float], u: Sequence[float]
+    along: AlongAxis, readings: Sequence[float], value: Sequence[float], u: Sequence[float]
 ) -> Iterator[list[tuple[float, float, float]]]:
     """The bins that stand side by side, as (x, value, U): a line through them crosses nothing that was not measured."""
     places = sorted(
-        (place, v, half) for at, v, half in zip(angle, value, u, strict=True) if (place := angles(at)) is not None
+        (place, v, half) for at, v, half in zip(readings, value, u, strict=True) if (place := along(at)) is not None
     )
     run: list[tuple[float, float, float]] = []
     arc = -1
     for (index, x), v, half in places:
-        if run and (index != arc or x - run[-1][0] > 1.5 * BIN_DEG * angles.scale):
+        if run and (index != arc or x - run[-1][0] > 1.5 * along.course.bin_width * along.scale):
             yield run
             run = []
         arc = index
@@ -314,35 +324,41 @@ def _runs(
         yield run
 
 
-def unseen_arcs(seam: Sequence[SeamBin], coverage: Coverage | None) -> list[tuple[float, float]]:
+def unseen_arcs(
+    seam: Sequence[SeamBin], coverage: Coverage | None, course: SeamCourse = GIRTH
+) -> list[tuple[float, float]]:
     """What was required and not measured: the gaps, and the bins of the seam without a number.
 
     Returns:
-        Arcs apart from each other, (start, end) with an end perhaps beyond 360; degrees.
+        Stretches apart from each other, (start, end) with an end perhaps beyond a whole turn.
     """
-    arcs = [(each.angle_deg - BIN_DEG / 2, BIN_DEG) for each in seam if not each.measured]
-    arcs += [(start, (end - start) % 360 or 360.0) for start, end in (coverage.gaps if coverage else ())]
+    told, turn, width = course.told, course.turn, course.bin_width
+    arcs = [(each.angle_deg - width / 2, width) for each in seam if not each.measured]
+    arcs += [(start, told(end - start) or (turn or 0.0)) for start, end in (coverage.gaps if coverage else ())]
     apart: list[tuple[float, float]] = []
-    for start, length in sorted((start % 360, length) for start, length in arcs):
+    for start, length in sorted((told(start), length) for start, length in arcs):
         if apart and start <= apart[-1][1] + 1e-6:
             apart[-1] = (apart[-1][0], max(apart[-1][1], start + length))
         else:
             apart.append((start, start + length))
+    if turn is None:
+        return apart
     # The last may reach across the zero mark into the first ones.
-    while len(apart) > 1 and apart[-1][1] >= apart[0][0] + 360 - 1e-6:
+    while len(apart) > 1 and apart[-1][1] >= apart[0][0] + turn - 1e-6:
         first = apart.pop(0)
-        apart[-1] = (apart[-1][0], max(apart[-1][1], first[1] + 360))
-    if len(apart) == 1 and apart[0][1] - apart[0][0] >= 360 - 1e-6:
-        return [(0.0, 360.0)]
+        apart[-1] = (apart[-1][0], max(apart[-1][1], first[1] + turn))
+    if len(apart) == 1 and apart[0][1] - apart[0][0] >= turn - 1e-6:
+        return [(0.0, turn)]
     return apart
 
 
-def _draw_fates(svg: Svg, angles: AngleAxis, seam: Sequence[SeamBin], top: float, bottom: float) -> None:
+def _draw_fates(svg: Svg, along: AlongAxis, seam: Sequence[SeamBin], top: float, bottom: float) -> None:
     """Per bin a column of the shares of its pixels, the walls at the bottom."""
     columns: dict[str, list[str]] = {}
     for each in seam:
         total = sum(each.fate.values())
-        for x, width in angles.spans(each.angle_deg - BIN_DEG / 2, each.angle_deg + BIN_DEG / 2):
+        half = along.course.bin_width / 2
+        for x, width in along.spans(each.angle_deg - half, each.angle_deg + half):
             level = bottom
             if total == 0:
                 svg.add("rect", x=x, y=float(top), width=width, height=float(bottom - top), fill="url(#unseen)")
@@ -359,9 +375,9 @@ def _draw_fates(svg: Svg, angles: AngleAxis, seam: Sequence[SeamBin], top: float
     svg.upright(16, (top + bottom) / 2, "pixels")
 
 
-def _draw_numbers(svg: Svg, angles: AngleAxis, marks: Sequence[Mark], y: float) -> None:
+def _draw_numbers(svg: Svg, along: AlongAxis, marks: Sequence[Mark], y: float) -> None:
     """The bars' numbers above their columns; neighbours share a label."""
-    places = sorted((place[1], mark.number) for mark in marks if (place := angles(mark.at_deg)) is not None)
+    places = sorted((place[1], mark.number) for mark in marks if (place := along(mark.at_deg)) is not None)
     groups: list[tuple[list[float], list[int]]] = []
     for x, number_ in places:
         if groups and x - groups[-1][0][-1] < 22:
@@ -375,13 +391,13 @@ def _draw_numbers(svg: Svg, angles: AngleAxis, marks: Sequence[Mark], y: float) 
         svg.text(x, y - 7, ", ".join(map(str, sorted(set(numbers)))), "bar-number")
 
 
-def map_chart(pictures: Sequence[str], extent: Extent, scale_mm: float) -> str:
+def map_chart(pictures: Sequence[str], extent: Extent, scale_mm: float, course: SeamCourse = GIRTH) -> str:
     """The unrolled deviation map with its axes and colour bar."""
     height, top, bottom = 350, 14, 244
-    svg = Svg(WIDTH, height, "Deviation from the reference wall, unrolled: angle by axis")
-    angles = AngleAxis(extent.arcs)
-    angles.draw(svg, top, bottom)
-    for uri, (x, width) in zip(pictures, angles.places, strict=True):
+    svg = Svg(WIDTH, height, "Deviation from the reference wall, unrolled: along the seam by across it")
+    along = AlongAxis(extent.arcs, course)
+    along.draw(svg, top, bottom)
+    for uri, (x, width) in zip(pictures, along.places, strict=True):
         svg.add(
             "image", x=x, y=float(top), width=width, height=float(bottom - top), preserveAspectRatio="none", href=uri
         )
@@ -393,7 +409,7 @@ def map_chart(pictures: Sequence[str], extent: Extent, scale_mm: float) -> str:
     for tick in nice_ticks(extent.low_mm, extent.high_mm, 5):
         svg.line(LEFT - 5, y(tick), LEFT, y(tick), "zero")
         svg.text(LEFT - 9, y(tick) + 4, number(tick), "tick", "end")
-    svg.upright(16, (top + bottom) / 2, "along the axis, mm")
+    svg.upright(16, (top + bottom) / 2, "across the seam, mm")
     svg.colour_bar(bottom + 58, scale_mm, "inwards", "outwards, mm")
     return str(svg)
 
@@ -462,7 +478,7 @@ def clock(
 
     svg.add("circle", cx=115, cy=115, r=70, class_="ring")
     measured = [] if step is None else step.angle_deg[step.measured].tolist()
-    for start, end in arcs_of(measured, bridge_deg=BIN_DEG):
+    for start, end in arcs_of(measured, bridge=GIRTH.bin_width):
         arc(start, end, "ring-seen")
     for start, end in unseen_arcs(seam, coverage):
         arc(start, end, "ring-gap")

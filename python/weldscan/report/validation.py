@@ -11,7 +11,7 @@ import numpy as np
 
 from weldscan.records.files import plain, to_json, whole_folder, write_synced
 from weldscan.records.validation import is_validation, validation_document, validation_rows
-from weldscan.report.charts import LEFT, RIGHT, WIDTH, AngleAxis, Svg, arcs_of, nice_ticks
+from weldscan.report.charts import LEFT, RIGHT, WIDTH, AlongAxis, Svg, arcs_of, nice_ticks
 from weldscan.report.page import fill
 from weldscan.report.pictures import diverging
 from weldscan.result import Validation
@@ -53,7 +53,7 @@ def where(found: Validation) -> Svg:
     top, bottom = 14, 250
     svg = Svg(WIDTH, 356, "Probed points on the unrolled part, coloured by their distance from the scanned surface")
     placed = np.isfinite(found.angle_deg)
-    angles = AngleAxis(arcs_of(found.angle_deg[placed].tolist(), bridge_deg=20))
+    angles = AlongAxis(arcs_of(found.angle_deg[placed].tolist(), bridge=20))
     angles.draw(svg, top, bottom)
     low, high = float(found.axial_mm[placed].min()), float(found.axial_mm[placed].max())
     margin = 0.06 * (high - low) + 1.0

@@ -8,7 +8,7 @@ from weldscan.result.findings import CODES, Finding, Severity, bar, note, warnin
 from weldscan.result.hand_eye import ArtefactShot, ArtefactSphere, HandEye
 from weldscan.result.inspection import Inspection, ScannerRecord, ShotAgreement
 from weldscan.result.scanner import BoardPose, NextPose, ScannerCalibration, VolumePoint
-from weldscan.result.seam import FATES, WHOLE_TURN_DEG, Coverage, SeamBin, along_seam_mm
+from weldscan.result.seam import FATES, WHOLE_TURN_DEG, Coverage, SeamBin
 from weldscan.result.standing import Standing
 from weldscan.result.step import BudgetLine, Histogram, StepResult
 from weldscan.result.validation import Validation
@@ -48,7 +48,6 @@ __all__ = [
     "Verdict",
     "Verification",
     "VolumePoint",
-    "along_seam_mm",
     "bar",
     "note",
     "warning",

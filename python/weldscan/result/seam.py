@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 WHOLE_TURN_DEG = 360.0
 
@@ -30,16 +27,6 @@ class SeamBin:
     cap_width_mm: float | None = None
     toes_mm: tuple[float, float] | None = None
     """Both toes, along the axis from the seam's centreline: reference side, other side."""
-
-
-def along_seam_mm(angle_deg: float, part: Mapping[str, Any]) -> float | None:
-    """Length along the seam of a pipe from its zero mark, on the rated outside; None where no diameter is known.
-
-    >>> round(along_seam_mm(90.0, {"outside_diameter": 400.0}), 3)
-    314.159
-    """
-    diameter = part.get("outside_diameter")
-    return None if not diameter else math.radians(angle_deg % 360) * diameter / 2
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ def _document(cell: Cell, shots: Sequence[_Shot], random: np.random.Generator) -
     weld = np.asarray(cell.base_from_weld)
     in_scanner = np.eye(4) if cell.robot is not None else np.linalg.inv(shots[0].base_from_scanner)
     if math.isinf(cell.weld.reference.radius_mm):
-        raise InputError("weld: a plate cannot be measured yet, so that no session of one is written; render() shows it")
+        raise InputError("weld: a plate cannot be measured yet, so no session of one is written; render() shows it")
     document: dict[str, Any] = {
         "schema": "weldscan-session/1",
         "name": cell.name,

@@ -11,6 +11,7 @@ mod fringes;
 mod ground;
 mod pickle;
 mod scanner;
+mod seam;
 mod simulate;
 mod surfaces;
 mod weld;
@@ -31,6 +32,7 @@ fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
     surfaces::register(m)?;
     scanner::register(m)?;
     clouds::register(m)?;
+    seam::register(m)?;
     weld::register(m)?;
     simulate::register(m)?;
     pickle::register(m)

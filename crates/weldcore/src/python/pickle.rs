@@ -24,6 +24,7 @@ use crate::python::fringes::wrapped::PyWrappedPhase;
 use crate::python::ground::transform::PyRigidFit;
 use crate::python::scanner::lens::{PyLens, PyScanner};
 use crate::python::scanner::triangulate::{PyCloud, PyReferencePlane};
+use crate::python::seam::{PyCourse, PySeam};
 use crate::python::simulate::scene::PyWeldSurface;
 use crate::python::simulate::shot::PyShot;
 use crate::python::surfaces::find_spheres::PyFoundSphere;
@@ -36,7 +37,7 @@ use crate::surfaces::find_spheres::FoundSphere;
 use crate::surfaces::{Cylinder, Plane, Sphere};
 use crate::weld::sections::{Doubt, Edge, Grid, Kind, Sections, Station, WallRun};
 use crate::weld::segment::Segmentation;
-use crate::weld::{PipeFrame, Unrolled};
+use crate::weld::{Course, Seam, Unrolled};
 
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
@@ -80,6 +81,7 @@ macro_rules! by_way_of {
 
 by_way_of! {
     usize: u64, |n: &usize| *n as u64, |n| usize::try_from(n).ok();
+    Course: f64, |c: &Course| c.radius_mm(), |radius_mm| Course::of_radius(radius_mm).ok();
     bool: u8, |b: &bool| u8::from(*b), |n| (n < 2).then_some(n == 1);
     String: Vec<u8>, |text: &String| text.clone().into_bytes(), |bytes| String::from_utf8(bytes).ok();
     Kind: u8, |k: &Kind| *k as u8, |n| [Kind::Unknown, Kind::Raised, Kind::Hollow, Kind::Flush].get(usize::from(n)).copied();
@@ -186,21 +188,21 @@ structs! {
     PyRigidFit { fit, rms_mm }
     icp::Weak { kind, axis, point_mm, strength, vector }
     icp::Registration { target_from_source, converged, iterations, rms_mm, inliers, covariance, unobserved }
-    PipeFrame { origin_mm, axis, zero, radius_mm }
-    Unrolled { angle_rad, axial_mm, deviation_mm }
+    Seam { origin_mm, across, zero, course }
+    Unrolled { at, across_mm, height_mm }
     Grid {
-        middle_rad, radius_mm, start_along, station_mm, stations, start_across, bin_mm, bins, heights, noise_mm,
+        middle, course, start_along, station_mm, stations, start_across, bin_mm, bins, heights, noise_mm,
         cell_sigma_mm,
     }
     WallRun { from, to, height, slope, shrinkage, rms, slope_u, centre, shell_mm }
     Edge { step_mm, standard_mm, hull_mm, foot_mm }
     Station {
-        angle_rad, seen, kind, by_course, toes_mm, height_mm, edge, undisturbed_mm, departure_mm, wall_step_mm, walls,
+        at, seen, kind, by_course, toes_mm, height_mm, edge, undisturbed_mm, departure_mm, wall_step_mm, walls,
     }
-    Doubt { code, angle_rad, text }
+    Doubt { code, at, text }
     Sections { grid, stations, station_mm, doubts, cap_width_mm, cap_height_mm, noise_mm }
     Segmentation {
-        frame, labels, unrolled, noise_mm, bead_width_mm, radius_fitted, fates, thickness_mm, sections,
+        seam, labels, unrolled, noise_mm, bead_width_mm, course_fitted, fates, thickness_mm, sections,
     }
     Sample { depth_mm, column_px, row_px, deviation_mm, along, direct, ambient, label }
     Photometry { lamp, distance_mm, ambient, black, gamma, blur_px, full_well_e, read_noise_e, bits, seed }
@@ -248,6 +250,8 @@ by_bytes! {
     PyWeak: o => o.0, it => Self(it);
     PyRegistration: o => o.0, it => Self(it);
     PyFoundSphere: o => o.0, it => Self(it);
+    PyCourse: o => o.0, it => Self(it);
+    PySeam: o => o.0, it => Self(it);
     WeldShot: o => o.0, it => Self(it);
     PlaneFit: o => *o, it => it;
     SphereFit: o => *o, it => it;
@@ -391,7 +395,7 @@ macro_rules! classes {
 classes! {
     PyLens, PyScanner, PyPhaseMap, PyDisagreement, PyWrappedPhase, PyPhaseError, PyCloud, PyReferencePlane, PyKdTree,
     PyFollower, PyPlane, PySphere, PyCylinder, PyMesh, PlaneFit, SphereFit, CylinderFit, PyFoundSphere, PyWeak,
-    PyRegistration, PyRigidFit, WeldShot, PyShot, PyWeldSurface,
+    PyRegistration, PyRigidFit, PyCourse, PySeam, WeldShot, PyShot, PyWeldSurface,
 }
 
 /// What `_put_together` is called with.

@@ -16,11 +16,12 @@ use crate::ground::transform::Vec3;
 use crate::python::call::{compute, raise};
 use crate::python::convert::vector;
 use crate::python::convert::{Whole, floats, parts};
-use crate::weld::Nominal;
+use crate::python::seam::PySeam;
 use crate::weld::place::{self, Scan};
 use crate::weld::sections::Station;
 use crate::weld::segment::{self, Segmentation};
 use crate::weld::step::{self, Known, LabelledShot};
+use crate::weld::{Course, Nominal};
 
 /// One part shot, cut into reference wall, other wall and bead (see `segment_weld`).
 #[pyclass(frozen, module = "weldscan")]
@@ -28,30 +29,35 @@ pub(crate) struct WeldShot(pub(crate) Segmentation);
 
 #[pymethods]
 impl WeldShot {
+    /// The seam's frame, on the surface of the reference wall: what turns points into along, across, height.
+    #[getter]
+    fn seam(&self) -> PySeam {
+        PySeam(self.0.seam)
+    }
     /// (3,) float64, mm: on the axis at the seam's centreline, frame of the points.
     #[getter]
     fn origin_mm<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        PyArray1::from_slice(py, self.0.frame.origin_mm.as_slice())
+        PyArray1::from_slice(py, self.0.seam.origin_mm.as_slice())
     }
     /// (3,) float64, unit: from the reference wall to the other wall.
     #[getter]
     fn axis<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        PyArray1::from_slice(py, self.0.frame.axis.as_slice())
+        PyArray1::from_slice(py, self.0.seam.across.as_slice())
     }
     /// (3,) float64, unit: towards angle 0.
     #[getter]
     fn zero<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        PyArray1::from_slice(py, self.0.frame.zero.as_slice())
+        PyArray1::from_slice(py, self.0.seam.zero.as_slice())
     }
     /// Radius of the reference wall, mm.
     #[getter]
     fn radius_mm(&self) -> f64 {
-        self.0.frame.radius_mm
+        self.0.seam.course.radius_mm()
     }
     /// Whether the radius was fitted; False: the arc is too short for that and the nominal one was used.
     #[getter]
     fn radius_fitted(&self) -> bool {
-        self.0.radius_fitted
+        self.0.course_fitted
     }
     /// Noise of one point across the wall, mm (robust, 1 sigma).
     #[getter]
@@ -71,25 +77,25 @@ impl WeldShot {
     /// (H * W,) float32, rad, in [-pi, pi]; NaN without a point.
     #[getter]
     fn angle_rad<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
-        PyArray1::from_slice(py, &self.0.unrolled.angle_rad)
+        PyArray1::from_slice(py, &self.0.unrolled.at)
     }
     /// (H * W,) float32, mm from the seam's centreline; the reference wall is negative.
     #[getter]
     fn axial_mm<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
-        PyArray1::from_slice(py, &self.0.unrolled.axial_mm)
+        PyArray1::from_slice(py, &self.0.unrolled.across_mm)
     }
     /// (H * W,) float32, mm: radial deviation from the reference wall's cylinder.
     #[getter]
     fn deviation_mm<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
-        PyArray1::from_slice(py, &self.0.unrolled.deviation_mm)
+        PyArray1::from_slice(py, &self.0.unrolled.height_mm)
     }
     /// (H * W,) uint8: what became of each point: 0 none, 1 wall, 2 transition, 3 cap, 4 gated, 5 off line, 6 other.
     #[getter]
     fn fates<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u8>> {
         PyArray1::from_slice(py, &self.0.fates)
     }
-    /// The cross-sections along the seam: a dict of arrays over the stations (n,), NaN for what is not known: `angle_deg`
-    /// (middle of the station, [0, 360)), `seen` (bool), `kind` (uint8: 0 unknown, 1 raised, 2 hollow, 3 flush), `by_course` (bool: the
+    /// The cross-sections along the seam: a dict of arrays over the stations (n,), NaN for what is not known: `along`
+    /// (middle of the station, as a reading of the seam; also as `angle_deg`), `seen` (bool), `kind` (uint8: 0 unknown, 1 raised, 2 hollow, 3 flush), `by_course` (bool: the
     /// toes are those of the seam's course), `toes_mm` (n, 2) from the seam's centreline, reference side first, `height_mm` of
     /// the cap, `edge_step_mm` (other over reference, right beside the toes), `edge_standard_mm` (k = 1), `edge_hull_mm` (what the
     /// choice of the toes may hide, in full), `undisturbed_mm` (n, 2): from where outward the walls are undisturbed,
@@ -105,7 +111,10 @@ impl WeldShot {
             let flat: Vec<f64> = stations.iter().flat_map(|s| pick(s).map(|v| v.unwrap_or(f64::NAN))).collect();
             flat.into_pyarray(py).reshape([stations.len(), 2])
         };
-        out.set_item("angle_deg", one(&|s| Some(s.angle_rad.to_degrees().rem_euclid(360.0))))?;
+        let course = self.0.seam.course;
+        let along = one(&|s| Some(course.reading(s.at)));
+        out.set_item("along", &along)?;
+        out.set_item("angle_deg", along)?;
         out.set_item("seen", stations.iter().map(|s| s.seen).collect::<Vec<bool>>().into_pyarray(py))?;
         out.set_item("kind", stations.iter().map(|s| s.kind as u8).collect::<Vec<u8>>().into_pyarray(py))?;
         out.set_item("by_course", stations.iter().map(|s| s.by_course).collect::<Vec<bool>>().into_pyarray(py))?;
@@ -128,7 +137,7 @@ impl WeldShot {
     #[getter]
     fn doubts(&self) -> Vec<(&'static str, f64, String)> {
         let doubts = self.0.sections.doubts.iter();
-        doubts.map(|d| (d.code, d.angle_rad.to_degrees().rem_euclid(360.0), d.text.clone())).collect()
+        doubts.map(|d| (d.code, self.0.seam.course.reading(d.at), d.text.clone())).collect()
     }
     fn __repr__(&self) -> String {
         let count = |l: u8| self.0.labels.iter().filter(|x| **x == l).count();
@@ -172,13 +181,12 @@ fn segment_weld(
         return Err(wrong(format!("shape {shape:?}")));
     }
     let points = points_mm.as_slice().map_err(|_| wrong("strided".into()))?.as_chunks::<3>().0;
-    let nominal = Nominal {
-        radius_mm,
-        wall_thickness_mm,
-        axis: direction(py, "axis", axis)?,
-        zero: direction(py, "zero", zero)?,
-    };
-    compute(py, || segment::segment(points, shape[1], &nominal)).map(WeldShot)
+    let (axis, zero) = (direction(py, "axis", axis)?, direction(py, "zero", zero)?);
+    let segmented = compute(py, || {
+        let course = Course::of_radius(radius_mm)?;
+        segment::segment(points, shape[1], &Nominal { course, wall_thickness_mm, axis, zero })
+    });
+    segmented.map(WeldShot)
 }
 
 /// The columns of the profile that `measure_step` returns.
@@ -202,27 +210,25 @@ fn measure_step<'py>(
     let views: Vec<LabelledShot> = shots
         .iter()
         .map(|s| LabelledShot {
-            angle_rad: &s.0.unrolled.angle_rad,
-            axial_mm: &s.0.unrolled.axial_mm,
-            deviation_mm: &s.0.unrolled.deviation_mm,
+            unrolled: &s.0.unrolled,
             labels: &s.0.labels,
-            radius_mm: s.0.frame.radius_mm,
+            course: s.0.seam.course,
             bead_width_mm: s.0.bead_width_mm,
             thickness_mm: s.0.thickness_mm,
         })
         .collect();
-    let known = Known { angle_rad: angle_sigma_rad };
+    let known = Known { at: angle_sigma_rad };
     let step = compute(py, || step::measure(&views, &known))?;
     let out = PyDict::new(py);
     out.set_item("mean_mm", step.mean_mm)?;
     out.set_item("median_mm", step.median_mm)?;
     out.set_item("max_abs_mm", step.max_abs_mm)?;
-    out.set_item("max_abs_at_deg", step.max_abs_at_deg)?;
+    out.set_item("max_abs_at_deg", step.max_abs_at)?;
     out.set_item("expanded_mm", step.expanded_mm)?;
-    out.set_item("coverage_deg", step.coverage_deg)?;
-    out.set_item("radius_difference_mm", step.radius_difference_mm)?;
-    out.set_item("axis_offset_mm", step.axis_offset_mm)?;
-    out.set_item("axis_offset_standard_mm", step.axis_offset_standard_mm)?;
+    out.set_item("coverage_deg", step.coverage)?;
+    out.set_item("radius_difference_mm", step.curvature_mm)?;
+    out.set_item("axis_offset_mm", step.offset_mm)?;
+    out.set_item("axis_offset_standard_mm", step.offset_standard_mm)?;
     out.set_item("tilt_rad", step.tilt_rad)?;
     out.set_item("tilt_standard_rad", step.tilt_standard_rad)?;
     out.set_item("shape_degree", step.shape_degree)?;
@@ -235,8 +241,8 @@ fn measure_step<'py>(
         .profile
         .iter()
         .map(|b| {
-            let parts = [b.fit_mm, b.toe_mm, b.local_mm, b.angle_mm, b.unevenness_mm];
-            [b.angle_deg, b.seen_at_deg, b.step_mm, b.standard_mm].into_iter().chain(parts).collect()
+            let parts = [b.fit_mm, b.toe_mm, b.local_mm, b.place_mm, b.unevenness_mm];
+            [b.along, b.seen_along, b.step_mm, b.standard_mm].into_iter().chain(parts).collect()
         })
         .collect();
     let profile = PyArray2::from_vec2(py, &rows)
@@ -288,6 +294,7 @@ fn place_shots<'py>(py: Python<'py>, shots: &Bound<'py, PyAny>) -> PyResult<Plac
             points: flat(py, points)?,
             base_from_scanner: crate::python::convert::transform("base_from_scanner", base_from_scanner)?,
             unrolled: &shot.0.unrolled,
+            course: shot.0.seam.course,
             labels: &shot.0.labels,
             deviation_mm: deviation.as_slice().map_err(wrong)?,
             shot: u16::try_from(number.0).map_err(|_| {
@@ -302,8 +309,8 @@ fn place_shots<'py>(py: Python<'py>, shots: &Bound<'py, PyAny>) -> PyResult<Plac
         points,
         placed.labels.into_pyarray(py),
         placed.deviation_mm.into_pyarray(py),
-        placed.angle_deg.into_pyarray(py),
-        placed.axial_mm.into_pyarray(py),
+        placed.along.into_pyarray(py),
+        placed.across_mm.into_pyarray(py),
         placed.shot.into_pyarray(py),
     ))
 }

@@ -12,7 +12,6 @@
 //! What two shots share, an error of the hand-eye say, does not show. Neighbouring cells share the scanner's errors.
 
 use std::collections::BTreeMap;
-use std::f64::consts::TAU;
 
 use crate::error::{Error, Result, require_finite};
 use crate::ground::memory::require;
@@ -20,6 +19,7 @@ use crate::ground::robust::{MEDIAN_TO_SIGMA, median_between, quantile};
 use crate::ground::threads;
 use crate::ground::transform::Vec3;
 use crate::weld::label::Label;
+use crate::weld::seam::{Course, Seam};
 use crate::weld::segment::Segmentation;
 
 /// Cells in which the walls are compared: small against any pipe's radius, and of tens of points.
@@ -68,7 +68,7 @@ pub struct Difference {
     pub middle_mm: Vec3,
 }
 
-/// One shot's cells in their order: number around and along, mean distance from the axis, middle in base.
+/// One shot's cells in their order: number along and across the seam, mean height, middle in base.
 type Cells = Vec<((i64, i64), f64, Vec3)>;
 
 /// Holds every two shots against each other.
@@ -92,34 +92,23 @@ pub fn wall_differences(cloud: &WallCloud, shots: &[u16], origin_mm: Vec3, axis:
         .try_normalize(0.0)
         .filter(|a| a.iter().all(|c| c.is_finite()))
         .ok_or_else(|| Error::Degenerate { what, reason: "it has no direction".into() })?;
-    let zero = axis.cross(&if axis.z.abs() < 0.9 { Vec3::z() } else { Vec3::x() }).normalize();
-    let unroll = Unroll {
-        origin: origin_mm,
-        axes: [zero, axis.cross(&zero), axis],
-        around: cells_around(cloud, origin_mm, axis),
-    };
-    let seen: Vec<Cells> = walls_by_shot(cloud, shots).iter().map(|wall| cells(cloud.points, wall, &unroll)).collect();
+    let seam = through_the_middle(cloud, origin_mm, axis)?;
+    let seen: Vec<Cells> = walls_by_shot(cloud, shots).iter().map(|wall| cells(cloud.points, wall, &seam)).collect();
     let pairs: Vec<(usize, usize)> = (0..shots.len()).flat_map(|j| (0..j).map(move |i| (i, j))).collect();
     let found = threads::map_each(&pairs, |&(i, j)| difference(i, j, seen.get(i)?, seen.get(j)?));
     Ok(found.into_iter().flatten().collect())
 }
 
-/// The pipe's axis, and how many cells there are around it: a whole number, the same for every shot.
-struct Unroll {
-    origin: Vec3,
-    /// Towards angle 0, a quarter turn further, along.
-    axes: [Vec3; 3],
-    around: f64,
-}
-
-fn cells_around(cloud: &WallCloud, origin: Vec3, axis: Vec3) -> f64 {
+/// The seam whose surface runs through the middle of the points: it sets how many cells there are along it.
+fn through_the_middle(cloud: &WallCloud, origin: Vec3, axis: Vec3) -> Result<Seam> {
     let thinned = cloud.points.iter().step_by((cloud.points.len() / RADIUS_POINTS).max(1));
     let from_axis = |p: &[f64; 3]| {
         let v = Vec3::from(*p) - origin;
         (v - axis * v.dot(&axis)).norm()
     };
     let mut radii: Vec<f64> = thinned.map(from_axis).collect();
-    (TAU * median_between(&mut radii) / CELL_MM).round().max(8.0)
+    let zero = axis.cross(&if axis.z.abs() < 0.9 { Vec3::z() } else { Vec3::x() });
+    Seam::new(origin, axis, zero, Course::of_radius(median_between(&mut radii))?)
 }
 
 /// Indices of the walls' points of each shot, thinned.
@@ -144,17 +133,14 @@ fn walls_by_shot(cloud: &WallCloud, shots: &[u16]) -> Vec<Vec<usize>> {
     shots.iter().map(|number| place.get(number).map_or(Vec::new(), |&k| thinned(all(k)))).collect()
 }
 
-fn cells(points: &[[f64; 3]], wall: &[usize], unroll: &Unroll) -> Cells {
-    let [zero, quarter, axis] = unroll.axes;
+fn cells(points: &[[f64; 3]], wall: &[usize], seam: &Seam) -> Cells {
     let parts = threads::map_chunks(wall, |_, chunk| {
         let mut sums: BTreeMap<(i64, i64), (usize, f64, Vec3)> = BTreeMap::new();
         for &i in chunk {
-            let v = Vec3::from(points[i]) - unroll.origin;
-            let (x, y, along) = (v.dot(&zero), v.dot(&quarter), v.dot(&axis));
-            let turn = (y.atan2(x) / TAU).rem_euclid(1.0);
-            let cell = ((turn * unroll.around).floor() as i64, (along / CELL_MM).floor() as i64);
+            let [at, across, height] = seam.place(&points[i]);
+            let cell = (seam.course.cell(at, CELL_MM), (across / CELL_MM).floor() as i64);
             let sum = sums.entry(cell).or_default();
-            *sum = (sum.0 + 1, sum.1 + x.hypot(y), sum.2 + v);
+            *sum = (sum.0 + 1, sum.1 + height, sum.2 + Vec3::from(points[i]) - seam.origin_mm);
         }
         sums
     });
@@ -164,13 +150,13 @@ fn cells(points: &[[f64; 3]], wall: &[usize], unroll: &Unroll) -> Cells {
         *sum = (sum.0 + more.0, sum.1 + more.1, sum.2 + more.2);
     }
     let full = sums.into_iter().filter(|(_, sum)| sum.0 >= LEAST_POINTS);
-    full.map(|(cell, (n, radius, v))| (cell, radius / n as f64, unroll.origin + v / n as f64)).collect()
+    full.map(|(cell, (n, height, v))| (cell, height / n as f64, seam.origin_mm + v / n as f64)).collect()
 }
 
 fn difference(one: usize, other: usize, a: &Cells, b: &Cells) -> Option<Difference> {
     let seen: BTreeMap<(i64, i64), (f64, Vec3)> =
-        a.iter().map(|&(cell, radius, middle)| (cell, (radius, middle))).collect();
-    let common = || b.iter().filter_map(|(cell, radius, _)| seen.get(cell).map(|(r, middle)| (radius - r, middle)));
+        a.iter().map(|&(cell, height, middle)| (cell, (height, middle))).collect();
+    let common = || b.iter().filter_map(|(cell, height, _)| seen.get(cell).map(|(h, middle)| (height - h, middle)));
     let mut off: Vec<f64> = common().map(|c| c.0).collect();
     let cells = off.len();
     if cells < LEAST_CELLS {
@@ -191,7 +177,7 @@ pub struct WallSeen {
     pub middle_rad: f64,
     /// Half the arc that was seen.
     pub half_arc_rad: f64,
-    /// Standard deviation of `along * sin(angle)`, the only form that a turn across the line of sight has.
+    /// Standard deviation of `across * sin(angle)`, the only form that a turn across the line of sight has.
     pub twist_mm: f64,
     /// Unevenness beyond what is the same all along the wall or all around it, rms.
     pub waves_mm: f64,
@@ -204,7 +190,7 @@ pub fn wall_seen(shot: &Segmentation) -> Option<WallSeen> {
     let thinned: Vec<usize> = wall.iter().copied().step_by((wall.len() / FORM_POINTS).max(1)).collect();
     let gather = |from: &[f32]| -> Vec<f64> { thinned.iter().map(|&i| f64::from(from[i])).collect() };
     let unrolled = &shot.unrolled;
-    form(&gather(&unrolled.angle_rad), &gather(&unrolled.axial_mm), &gather(&unrolled.deviation_mm))
+    form(shot.seam.course, &gather(&unrolled.at), &gather(&unrolled.across_mm), &gather(&unrolled.height_mm))
 }
 
 fn mean(values: impl ExactSizeIterator<Item = f64>) -> f64 {
@@ -212,18 +198,18 @@ fn mean(values: impl ExactSizeIterator<Item = f64>) -> f64 {
     values.sum::<f64>() / n
 }
 
-fn form(angle_rad: &[f64], along_mm: &[f64], deviation_mm: &[f64]) -> Option<WallSeen> {
-    if angle_rad.is_empty() {
+fn form(course: Course, at: &[f64], across_mm: &[f64], height_mm: &[f64]) -> Option<WallSeen> {
+    if at.is_empty() {
         return None;
     }
-    let middle_rad = mean(angle_rad.iter().map(|a| a.sin())).atan2(mean(angle_rad.iter().map(|a| a.cos())));
-    let off: Vec<f64> = angle_rad.iter().map(|a| (a - middle_rad).sin().atan2((a - middle_rad).cos())).collect();
-    let along_middle = mean(along_mm.iter().copied());
-    let twists: Vec<f64> = along_mm.iter().zip(&off).map(|(a, o)| (a - along_middle) * o.sin()).collect();
+    let middle_rad = course.middle(at.iter().copied());
+    let off: Vec<f64> = at.iter().map(|a| course.apart(*a, middle_rad)).collect();
+    let across_middle = mean(across_mm.iter().copied());
+    let twists: Vec<f64> = across_mm.iter().zip(&off).map(|(a, o)| (a - across_middle) * o.sin()).collect();
     let twist = mean(twists.iter().copied());
     let twist_mm = mean(twists.iter().map(|t| (t - twist).powi(2))).sqrt();
     let half_arc_rad = quantile(&mut off.iter().map(|o| o.abs()).collect::<Vec<_>>(), ARC_SHARE);
-    Some(WallSeen { middle_rad, half_arc_rad, twist_mm, waves_mm: waves(&off, along_mm, deviation_mm) })
+    Some(WallSeen { middle_rad, half_arc_rad, twist_mm, waves_mm: waves(&off, across_mm, height_mm) })
 }
 
 /// Of each value the number of its part, of parts with as many values each.
@@ -255,6 +241,8 @@ fn waves(angle: &[f64], along: &[f64], deviation: &[f64]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use std::f64::consts::TAU;
+
     use super::*;
 
     /// Two walls of a pipe along x as two shots saw them, the second's further out by `off_mm`.
@@ -317,16 +305,17 @@ mod tests {
                 wall.2.push((3.0 * angle).cos() + (-along / 20.0).exp());
             }
         }
-        let plain = form(&wall.0, &wall.1, &wall.2).unwrap();
+        let course = Course::of_radius(150.0).unwrap();
+        let plain = form(course, &wall.0, &wall.1, &wall.2).unwrap();
         assert!(plain.waves_mm < 1e-6 && (plain.half_arc_rad - 0.98 * 0.4).abs() < 0.01);
         assert!((plain.middle_rad - (3.3 - TAU)).abs() < 0.01);
         let sign = |v: f64| if v.rem_euclid(2.0) < 1.0 { amplitude } else { -amplitude };
         for ((d, a), z) in wall.2.iter_mut().zip(&wall.0).zip(&wall.1) {
             *d += sign((a.rem_euclid(TAU) - 2.9) / 0.08) * sign((z - 10.0) / 8.0) / amplitude;
         }
-        let waved = form(&wall.0, &wall.1, &wall.2).unwrap();
+        let waved = form(course, &wall.0, &wall.1, &wall.2).unwrap();
         assert!((waved.waves_mm / amplitude - 1.0).abs() < 0.1, "{waved:?}");
-        assert!(form(&[], &[], &[]).is_none());
+        assert!(form(course, &[], &[], &[]).is_none());
     }
 
     #[test]

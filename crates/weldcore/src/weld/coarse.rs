@@ -3,7 +3,7 @@
 use nalgebra::Matrix3;
 use rayon::prelude::*;
 
-use super::pipe_frame::PipeFrame;
+use super::seam::{Course, Seam};
 use crate::error::{Error, Result, require_count};
 use crate::ground::robust::{MEDIAN_TO_SIGMA, TUKEY_SIGMAS, median, tukey};
 use crate::ground::stop::polled;
@@ -16,9 +16,9 @@ const COARSE_POINTS: f64 = 20_000.0;
 /// What is known of the part before it is scanned, in the frame of the points.
 #[derive(Debug, Clone, Copy)]
 pub struct Nominal {
-    /// Outer radius of the pipe.
-    pub radius_mm: f64,
-    /// Of the pipe.
+    /// How the seam runs, by the part's rated size.
+    pub course: Course,
+    /// Of the part.
     pub wall_thickness_mm: f64,
     /// From the reference wall to the other wall; without it the axis comes from the points, and points to the right of
     /// the image (or down, where it runs so).
@@ -40,7 +40,7 @@ fn normal(points: &[[f64; 3]], width: usize, row: usize, column: usize, reach: u
 
 /// A cylinder of the nominal radius near the points: axis from the normals, place from a vote of `p - R n`, both then
 /// refined with the points that agree. Degrees and millimetres suffice.
-pub(super) fn coarse_frame(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<PipeFrame> {
+pub(super) fn coarse_frame(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<Seam> {
     // Normals over a twentieth of the radius, at most: the surface must be nearly flat there, and longer is less noisy.
     let height = points.len() / width;
     let stride = ((points.len() as f64 / COARSE_POINTS).sqrt() as usize).max(1);
@@ -64,8 +64,7 @@ pub(super) fn coarse_frame(points: &[[f64; 3]], width: usize, nominal: &Nominal)
         let view = -middle;
         view - axis * axis.dot(&view)
     });
-    let radius = nominal.radius_mm;
-    let mut frame = PipeFrame::new(middle, axis, zero, radius)?;
+    let mut frame = Seam::new(middle, axis, zero, nominal.course)?;
     frame.origin_mm = vote_centre(&seen, &frame);
     refine_centre(&seen, &mut frame);
     Ok(frame)
@@ -112,11 +111,11 @@ fn axis_from_normals(seen: &[(Vec3, Vec3)], prior: Option<Vec3>) -> Result<Vec3>
 }
 
 /// Where most of `p - R n` meet across the axis: the fullest of cells of a twentieth of the radius, and its mean.
-fn vote_centre(seen: &[(Vec3, Vec3)], frame: &PipeFrame) -> Vec3 {
-    let square = frame.axis.cross(&frame.zero);
-    let cell = frame.radius_mm / 20.0;
+fn vote_centre(seen: &[(Vec3, Vec3)], frame: &Seam) -> Vec3 {
+    let square = frame.square();
+    let cell = frame.course.radius_mm() / 20.0;
     let place = |p: &Vec3, n: &Vec3| {
-        let v = p - n * frame.radius_mm - frame.origin_mm;
+        let v = p - n * frame.course.radius_mm() - frame.origin_mm;
         (v.dot(&frame.zero), v.dot(&square))
     };
     let mut votes: std::collections::BTreeMap<(i64, i64), (usize, f64, f64)> = Default::default();
@@ -132,10 +131,10 @@ fn vote_centre(seen: &[(Vec3, Vec3)], frame: &PipeFrame) -> Vec3 {
 }
 
 /// Moves the axis sideways to the least squares of the radial deviations, reweighted; in place.
-fn refine_centre(seen: &[(Vec3, Vec3)], frame: &mut PipeFrame) {
-    let square = frame.axis.cross(&frame.zero);
+fn refine_centre(seen: &[(Vec3, Vec3)], frame: &mut Seam) {
+    let square = frame.square();
     for _ in 0..10 {
-        let deviation = |p: &Vec3| frame.unroll(&(*p).into());
+        let deviation = |p: &Vec3| frame.place(&(*p).into());
         let mut sizes: Vec<f64> = seen.iter().map(|(p, _)| deviation(p)[2].abs()).collect();
         let scale = TUKEY_SIGMAS * MEDIAN_TO_SIGMA * median(&mut sizes).max(1e-6);
         let (mut xx, mut xy, mut yy, mut bx, mut by) = (0.0, 0.0, 0.0, 0.0, 0.0);
@@ -155,7 +154,7 @@ fn refine_centre(seen: &[(Vec3, Vec3)], frame: &mut PipeFrame) {
         }
         let (dx, dy) = ((yy * bx - xy * by) / det, (xx * by - xy * bx) / det);
         frame.origin_mm += frame.zero * dx + square * dy;
-        if dx.hypot(dy) < 1e-6 * frame.radius_mm {
+        if dx.hypot(dy) < 1e-6 * frame.course.radius_mm() {
             return;
         }
     }

@@ -4,8 +4,8 @@ pub mod agreement;
 mod coarse;
 mod label;
 pub mod paper;
-mod pipe_frame;
 pub mod place;
+mod seam;
 pub mod seam_fates;
 pub mod sections;
 pub mod segment;
@@ -14,4 +14,4 @@ pub mod whitening;
 
 pub use coarse::Nominal;
 pub use label::{Fate, Label};
-pub use pipe_frame::{PipeFrame, Unrolled};
+pub use seam::{Course, Seam, Unrolled};

@@ -7,7 +7,7 @@ use crate::ground::memory::require;
 use crate::ground::stop::polled;
 use crate::ground::threads::{self, CHUNK};
 use crate::ground::transform::Transform;
-use crate::weld::pipe_frame::Unrolled;
+use crate::weld::seam::{Course, Unrolled};
 
 /// One segmented shot with its place.
 #[derive(Debug, Clone, Copy)]
@@ -16,8 +16,10 @@ pub struct Scan<'a> {
     pub points: &'a [[f64; 3]],
     /// Where the scanner stood.
     pub base_from_scanner: Transform,
-    /// The same points about the pipe's axis.
+    /// The same points in the seam's frame.
     pub unrolled: &'a Unrolled,
+    /// How the seam runs.
+    pub course: Course,
     /// A label per point.
     pub labels: &'a [u8],
     /// Deviation per point from the corrected reference wall; points without one (NaN) are left out.
@@ -35,10 +37,10 @@ pub struct Placed {
     pub labels: Vec<u8>,
     /// Deviation per point.
     pub deviation_mm: Vec<f32>,
-    /// Angle per point, in [0, 360).
-    pub angle_deg: Vec<f32>,
-    /// Axial coordinate per point.
-    pub axial_mm: Vec<f32>,
+    /// Along the seam per point, as a reading ([`Course::reading`]).
+    pub along: Vec<f32>,
+    /// Across the seam per point.
+    pub across_mm: Vec<f32>,
     /// Shot per point.
     pub shot: Vec<u16>,
 }
@@ -58,7 +60,7 @@ pub fn place(scans: &[Scan]) -> Result<Placed> {
     for s in scans {
         let n = s.points.len();
         let u = s.unrolled;
-        let lengths = [s.labels.len(), s.deviation_mm.len(), u.angle_rad.len(), u.axial_mm.len()];
+        let lengths = [s.labels.len(), s.deviation_mm.len(), u.at.len(), u.across_mm.len()];
         if lengths != [n; 4] {
             return Err(Error::Shape { what: "scan", expected: format!("{n} of each"), got: format!("{lengths:?}") });
         }
@@ -79,31 +81,30 @@ pub fn place(scans: &[Scan]) -> Result<Placed> {
             points: vec![0.0; 3 * total],
             labels: vec![0; total],
             deviation_mm: vec![0.0; total],
-            angle_deg: vec![0.0; total],
-            axial_mm: vec![0.0; total],
+            along: vec![0.0; total],
+            across_mm: vec![0.0; total],
             shot: vec![0; total],
         };
         let (mut points, mut labels, mut deviations) =
             (out.points.as_mut_slice(), out.labels.as_mut_slice(), out.deviation_mm.as_mut_slice());
-        let (mut angles, mut axials, mut shots) =
-            (out.angle_deg.as_mut_slice(), out.axial_mm.as_mut_slice(), out.shot.as_mut_slice());
+        let (mut along, mut across, mut shots) =
+            (out.along.as_mut_slice(), out.across_mm.as_mut_slice(), out.shot.as_mut_slice());
         let slots: Vec<_> = counts
             .iter()
             .map(|&n| {
                 let first = (take(&mut points, 3 * n), take(&mut labels, n), take(&mut deviations, n));
-                (first, (take(&mut angles, n), take(&mut axials, n), take(&mut shots, n)))
+                (first, (take(&mut along, n), take(&mut across, n), take(&mut shots, n)))
             })
             .collect();
         chunks.par_iter().inspect(polled).zip(slots).for_each(
-            |(&(s, start), ((points, labels, deviations), (angles, axials, shots)))| {
+            |(&(s, start), ((points, labels, deviations), (along, across, shots)))| {
                 for (slot, i) in indices(s, start).filter(|&i| kept(s, i)).enumerate() {
                     let p = s.base_from_scanner.apply(&s.points[i].into());
                     points[3 * slot..3 * slot + 3].copy_from_slice(p.as_slice());
                     labels[slot] = s.labels[i];
                     deviations[slot] = s.deviation_mm[i];
-                    let angle = s.unrolled.angle_rad[i].to_degrees();
-                    angles[slot] = if angle < 0.0 { (angle + 360.0).min(360.0_f32.next_down()) } else { angle };
-                    axials[slot] = s.unrolled.axial_mm[i];
+                    along[slot] = s.course.reading_f32(s.unrolled.at[i]);
+                    across[slot] = s.unrolled.across_mm[i];
                     shots[slot] = s.shot;
                 }
             },
@@ -122,13 +123,14 @@ mod tests {
         let n = 2 * CHUNK + 5;
         let points: Vec<[f64; 3]> = (0..n).map(|i| [i as f64, 0.0, 1.0]).collect();
         let deviation_mm: Vec<f32> = (0..n).map(|i| if i % 3 == 0 { f32::NAN } else { i as f32 }).collect();
-        let unrolled = Unrolled { angle_rad: vec![-0.5; n], axial_mm: vec![2.0; n], deviation_mm: vec![0.0; n] };
+        let unrolled = Unrolled { at: vec![-0.5; n], across_mm: vec![2.0; n], height_mm: vec![0.0; n] };
         let labels = vec![1; n];
         let base_from_scanner = Transform { translation: Vec3::new(0.0, 10.0, 0.0), ..Transform::identity() };
         let scan = |shot| Scan {
             points: &points,
             base_from_scanner,
             unrolled: &unrolled,
+            course: Course::of_radius(100.0).unwrap(),
             labels: &labels,
             deviation_mm: &deviation_mm,
             shot,
@@ -141,7 +143,7 @@ mod tests {
             assert_eq!(placed.deviation_mm[k], i as f32);
             assert_eq!(placed.shot[k], if k < each.len() { 0 } else { 7 });
         }
-        assert!((placed.angle_deg[0] - (360.0 - 0.5_f32.to_degrees())).abs() < 1e-4);
+        assert!((placed.along[0] - (360.0 - 0.5_f32.to_degrees())).abs() < 1e-4);
         assert!(place(&[Scan { labels: &[], ..scan(0) }]).is_err());
     }
 }

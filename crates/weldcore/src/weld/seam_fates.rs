@@ -1,7 +1,7 @@
 //! What became of every pixel of a part shot, bin by bin along the seam: none is forgotten.
 //!
 //! A pixel with a point has the fate that [`crate::weld::segment`] gave it. A pixel without one lies where its ray meets the
-//! cylinder of the reference wall, and its fate is the reason that decoding gave.
+//! surface of the reference wall, and its fate is the reason that decoding gave.
 
 use super::label::Fate;
 use super::segment::Segmentation;
@@ -14,8 +14,6 @@ use crate::scanner::Lens;
 /// The fates, in the order of `weldscan.result.FATES`: wall, transition, cap, gated, off line, dark, saturated, order in
 /// doubt, two paths, outside the calibration, hidden, other.
 pub const FATES: usize = 12;
-/// Bins of the seam by contract: 2 degrees, centred on even ones.
-pub const BINS: usize = 180;
 /// Pixels this near to the weld count as its own: the surfaces beside the toes are read from them.
 const NEAR_MM: f64 = 8.0;
 
@@ -59,35 +57,34 @@ pub fn seam_fates(shot: &Segmentation, reasons: &[u8], camera: &Lens) -> Result<
         let got = format!("{} points and {} reasons", shot.fates.len(), reasons.len());
         return Err(Error::Shape { what: "shot", expected: format!("{n} pixels of the camera"), got });
     }
-    let frame = &shot.frame;
-    let toes: Vec<(f64, [f64; 2])> =
-        shot.sections.stations.iter().filter_map(|s| Some((s.angle_rad, s.toes_mm?))).collect();
-    let half = toes.iter().map(|t| 0.5 * (t.1[1] - t.1[0])).fold(0.0, f64::max) + NEAR_MM;
-    // How far the view reaches along the axis: beyond it no ray is the seam's.
-    let reach = |i: usize| f64::from(shot.unrolled.axial_mm[i]);
+    let seam = &shot.seam;
+    let bins = seam.course.bins();
+    let toes = shot.sections.stations.iter().filter_map(|s| s.toes_mm);
+    let half = toes.map(|t| 0.5 * (t[1] - t[0])).fold(0.0, f64::max) + NEAR_MM;
+    // How far the view reaches across: beyond it no ray is the seam's.
+    let reach = |i: usize| f64::from(shot.unrolled.across_mm[i]);
     let walls = (0..n).step_by(7).filter(|&i| shot.fates[i] == Fate::Wall as u8);
     let (low, high) = walls.map(reach).fold((f64::INFINITY, f64::NEG_INFINITY), |r, z| (r.0.min(z), r.1.max(z)));
-    let bin = |angle: f64| ((angle.to_degrees() / 2.0).round() as i64).rem_euclid(BINS as i64) as usize;
     let one = |i: usize| -> Option<(usize, usize, f64)> {
         if let Some(fate) = of_fate(shot.fates[i]) {
-            return Some((bin(f64::from(shot.unrolled.angle_rad[i])), fate, reach(i)));
+            return Some((seam.course.bin(f64::from(shot.unrolled.at[i])), fate, reach(i)));
         }
         let (x, y) = camera.undistort((i % camera.width) as f64, (i / camera.width) as f64)?;
-        let foot = meet(&Vec3::new(x, y, 1.0), &frame.origin_mm, &frame.axis, frame.radius_mm)?;
-        let [angle, axial, _] = frame.unroll(&foot.into());
-        (axial > low && axial < high).then(|| (bin(angle), of_reason(reasons[i]), axial))
+        let foot = seam.meet(&Vec3::new(x, y, 1.0))?;
+        let [at, across, _] = seam.place(&foot.into());
+        (across > low && across < high).then(|| (seam.course.bin(at), of_reason(reasons[i]), across))
     };
     let parts = threads::map_ranges(n, |range| {
-        let mut part = (vec![[0_u32; FATES]; BINS], vec![[0_u32; FATES]; BINS]);
-        for (bin, fate, axial) in range.filter_map(one) {
+        let mut part = (vec![[0_u32; FATES]; bins], vec![[0_u32; FATES]; bins]);
+        for (bin, fate, across) in range.filter_map(one) {
             part.0[bin][fate] += 1;
-            part.1[bin][fate] += u32::from(axial.abs() < half);
+            part.1[bin][fate] += u32::from(across.abs() < half);
         }
         part
     });
-    let mut found = SeamFates { all: vec![[0; FATES]; BINS], near: vec![[0; FATES]; BINS] };
+    let mut found = SeamFates { all: vec![[0; FATES]; bins], near: vec![[0; FATES]; bins] };
     for (all, near) in parts {
-        for k in 0..BINS {
+        for k in 0..bins {
             for f in 0..FATES {
                 found.all[k][f] += all[k][f];
                 found.near[k][f] += near[k][f];
@@ -95,15 +92,6 @@ pub fn seam_fates(shot: &Segmentation, reasons: &[u8], camera: &Lens) -> Result<
         }
     }
     Ok(found)
-}
-
-/// Where a ray from the origin first meets a cylinder.
-fn meet(ray: &Vec3, point: &Vec3, axis: &Vec3, radius: f64) -> Option<Vec3> {
-    let across = |v: &Vec3| v - axis * axis.dot(v);
-    let (d, o) = (across(ray), across(point));
-    let (a, b, c) = (d.norm_squared(), d.dot(&o), o.norm_squared() - radius * radius);
-    let root = b * b - a * c;
-    (a > 0.0 && root >= 0.0).then(|| (b - root.sqrt()) / a).filter(|t| *t > 0.0).map(|t| ray * t)
 }
 
 #[cfg(test)]
@@ -136,16 +124,9 @@ mod tests {
             assert!(f64::from(total(fate)) > 0.9 * lost as f64, "{fate} {} {lost}", total(fate));
         }
         assert!(total(0) > 8 * valid / 10 && total(2) > 0 && total(3) == 0);
-        for k in 0..BINS {
+        for k in 0..found.all.len() {
             assert!(std::iter::zip(found.near[k], found.all[k]).all(|(near, all)| near <= all));
         }
         assert!(seam_fates(&shot, &reasons[1..], &camera).is_err());
-    }
-
-    #[test]
-    fn a_ray_meets_the_near_side_of_a_cylinder() {
-        let hit = meet(&Vec3::z(), &Vec3::new(3.0, 0.0, 100.0), &Vec3::y(), 5.0).unwrap();
-        assert!((hit - Vec3::new(0.0, 0.0, 96.0)).norm() < 1e-12);
-        assert!(meet(&Vec3::z(), &Vec3::new(6.0, 0.0, 100.0), &Vec3::y(), 5.0).is_none());
     }
 }

@@ -1,34 +1,32 @@
 //! A scanned part into reference wall, other wall and bead, without seeds.
 //!
-//! The shot is unrolled about the pipe: angle, axial coordinate, radial deviation. [`crate::weld::sections`] finds cap, toes and
-//! undisturbed walls in it, station by station; every point gets a fate by them. The reference wall's cylinder is then
-//! fitted to its undisturbed points, with the weld's shrinkage taken out, and all is counted from it.
+//! The shot is unrolled into the seam's frame: along, across, height. [`crate::weld::sections`] finds cap, toes and undisturbed
+//! walls in it, station by station; every point gets a fate by them. The reference wall's surface is then fitted to its undisturbed points, with the weld's shrinkage taken out, and all is counted from it.
 
 use super::coarse::{Nominal, coarse_frame};
 use super::label::{Fate, Label};
-use super::pipe_frame::{PipeFrame, Unrolled};
+use super::seam::{Seam, Unrolled};
 use crate::error::{Error, Result, require_positive};
 use crate::ground::robust::median;
 use crate::ground::threads;
 use crate::ground::transform::Vec3;
-use crate::surfaces::{PointNoise, cylinder};
 use crate::weld::sections::{self, Sections, Station, TOLERANCE_MM, shell_term};
 
 /// A segmented shot.
 #[derive(Debug, Clone)]
 pub struct Segmentation {
-    /// The reference wall's cylinder with its origins.
-    pub frame: PipeFrame,
+    /// The seam, on the surface of the reference wall.
+    pub seam: Seam,
     /// A [`Label`] per point.
     pub labels: Vec<u8>,
-    /// The points in `frame`.
+    /// The points in the frame of `seam`.
     pub unrolled: Unrolled,
     /// Noise of one point across the wall (robust, 1 sigma).
     pub noise_mm: f64,
     /// Mean distance between the toes.
     pub bead_width_mm: f64,
-    /// Whether the radius was fitted; otherwise the arc was too short for it and it is the nominal one.
-    pub radius_fitted: bool,
+    /// Whether the course's size was fitted; otherwise too little was seen for it and it is the nominal one.
+    pub course_fitted: bool,
     /// A [`Fate`] per point.
     pub fates: Vec<u8>,
     /// Of the nominal wall.
@@ -45,21 +43,12 @@ const GATE_THICKNESSES: f64 = 2.0;
 const STRIP_HEIGHTS: f64 = 1.7;
 /// Points so many stations beyond the outermost ones, in the corners of a view, are held against those.
 const CORNER_STATIONS: f64 = 4.0;
-/// How far the real diameter of a pipe may be from its nominal one, relative (the usual delivery tolerance is 1 %). A
-/// radius that the arc does not determine better than this is taken as nominal.
-const DIAMETER_TOLERANCE: f64 = 0.01;
-/// A radius this far from the nominal one, relative, is another pipe's: ovality bends a pipe locally by a few per cent.
-const OTHER_PIPE: f64 = 0.2;
-/// Points that the cylinder of the reference wall is fitted to.
-const FIT_POINTS: usize = 40_000;
-
 /// Segments one shot. `points` is a pixel grid `width` wide, row-major, NaN where there is no point.
 ///
 /// # Errors
 /// [`Error::Shape`], [`Error::OutOfRange`] on bad arguments; [`Error::TooFew`] where there is next to nothing;
 /// [`Error::NotFound`] with the reason where no weld, or only one wall, is in view.
 pub fn segment(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<Segmentation> {
-    require_positive("pipe radius", nominal.radius_mm)?;
     require_positive("wall thickness", nominal.wall_thickness_mm)?;
     if width == 0 || !points.len().is_multiple_of(width) {
         let (expected, got) = (format!("rows of {width} pixels"), format!("{} pixels", points.len()));
@@ -69,20 +58,20 @@ pub fn segment(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<S
     let coarse = coarse_frame(points, width, nominal)?;
     let unrolled = Unrolled::of(points, &coarse);
     let thickness = nominal.wall_thickness_mm;
-    let mut sections = sections::examine(&unrolled, &coarse, thickness, GATE_THICKNESSES * thickness)?;
+    let mut sections = sections::examine(&unrolled, coarse.course, thickness, GATE_THICKNESSES * thickness)?;
     let (fates, labels) = sort_points(&sections, &unrolled, thickness);
     let wall = undrawn(points, &labels, &unrolled, &sections, &coarse, thickness);
-    let (frame, radius_fitted) = reference_frame(&wall, &coarse, nominal)?;
-    let frame = PipeFrame { origin_mm: frame.origin_mm + frame.axis * centreline(&sections, &coarse, &frame), ..frame };
-    reframe(&mut sections, &coarse, &frame);
+    let (seam, course_fitted) = coarse.refined(&wall, nominal.course)?;
+    let seam = Seam { origin_mm: seam.origin_mm + seam.across * centreline(&sections, &coarse, &seam), ..seam };
+    reframe(&mut sections, &coarse, &seam);
     Ok(Segmentation {
-        frame,
+        seam,
         labels,
         fates,
-        unrolled: Unrolled::of(points, &frame),
+        unrolled: Unrolled::of(points, &seam),
         noise_mm: sections.noise_mm,
         bead_width_mm: sections.cap_width_mm,
-        radius_fitted,
+        course_fitted,
         thickness_mm: thickness,
         sections,
     })
@@ -106,7 +95,7 @@ fn sort_points(sections: &Sections, unrolled: &Unrolled, thickness_mm: f64) -> (
         if !p.height.is_finite() {
             return (Fate::None, Label::None);
         }
-        // Beyond the pipe's arc there is nothing of the seam.
+        // Beyond the stations there is nothing of the seam.
         let Some(k) = grid.station_within(p.along, CORNER_STATIONS) else { return (Fate::Other, Label::None) };
         let Some((k, bed)) = beds[k] else {
             return (if p.height.abs() > gate { Fate::Gated } else { Fate::Other }, Label::None);
@@ -137,7 +126,7 @@ fn sort_points(sections: &Sections, unrolled: &Unrolled, thickness_mm: f64) -> (
         };
         (fate, label)
     };
-    let parts = threads::map_ranges(unrolled.angle_rad.len(), |range| {
+    let parts = threads::map_ranges(unrolled.at.len(), |range| {
         range.map(sort).map(|(fate, label)| (fate as u8, label as u8)).unzip::<u8, u8, Vec<u8>, Vec<u8>>()
     });
     let (fates, labels): (Vec<Vec<u8>>, Vec<Vec<u8>>) = parts.into_iter().unzip();
@@ -178,39 +167,39 @@ impl Bed {
     }
 }
 
-/// Where the middle between the toes lies along the axis of `frame`: mean over the stations.
-fn centreline(sections: &Sections, coarse: &PipeFrame, frame: &PipeFrame) -> f64 {
+/// Where the middle between the toes lies across `seam`: mean over the stations.
+fn centreline(sections: &Sections, coarse: &Seam, seam: &Seam) -> f64 {
     let (mut sum, mut count) = (0.0, 0.0);
     for station in &sections.stations {
         if let Some([low, high]) = station.toes_mm {
-            sum += frame.unroll(&coarse.point(station.angle_rad, 0.5 * (low + high)).into())[1];
+            sum += seam.place(&coarse.point(station.at, 0.5 * (low + high)).into())[1];
             count += 1.0;
         }
     }
     sum / f64::max(count, 1.0)
 }
 
-/// The stations in another frame: angles and places along the axis.
-fn reframe(sections: &mut Sections, coarse: &PipeFrame, frame: &PipeFrame) {
+/// The stations in another frame.
+fn reframe(sections: &mut Sections, coarse: &Seam, seam: &Seam) {
     for station in &mut sections.stations {
-        let angle = station.angle_rad;
-        let across = |x: f64| frame.unroll(&coarse.point(angle, x).into())[1];
+        let at = station.at;
+        let across = |x: f64| seam.place(&coarse.point(at, x).into())[1];
         station.toes_mm = station.toes_mm.map(|toes| toes.map(across));
         station.undisturbed_mm = station.undisturbed_mm.map(|from| from.map(across));
-        station.angle_rad = frame.unroll(&coarse.point(angle, 0.0).into())[0];
+        station.at = seam.place(&coarse.point(at, 0.0).into())[0];
     }
     for doubt in &mut sections.doubts {
-        doubt.angle_rad = frame.unroll(&coarse.point(doubt.angle_rad, 0.0).into())[0];
+        doubt.at = seam.place(&coarse.point(doubt.at, 0.0).into())[0];
     }
 }
 
-/// Points of the reference wall with the weld's shrinkage taken out, so that they lie on a cylinder.
+/// Points of the reference wall with the weld's shrinkage taken out, so that they lie on its surface.
 fn undrawn(
     points: &[[f64; 3]],
     labels: &[u8],
     unrolled: &Unrolled,
     sections: &Sections,
-    coarse: &PipeFrame,
+    coarse: &Seam,
     thickness_mm: f64,
 ) -> Vec<[f64; 3]> {
     // One amplitude: that of a single station is known too badly.
@@ -219,49 +208,20 @@ fn undrawn(
     let mut middles: Vec<f64> =
         sections.stations.iter().filter_map(|s| s.toes_mm.map(|t| 0.5 * (t[0] + t[1]))).collect();
     let middle = if middles.is_empty() { 0.0 } else { median(&mut middles) };
-    let square = coarse.axis.cross(&coarse.zero);
+    let shell_mm = coarse.course.shell_mm(thickness_mm);
     let wall = (0..points.len()).filter(|&i| labels[i] == Label::ReferenceWall as u8);
     wall.map(|i| {
-        let (sin, cos) = f64::from(unrolled.angle_rad[i]).sin_cos();
-        let z = f64::from(unrolled.axial_mm[i]) - middle;
-        let lift = -drawn * shell_term(z, coarse.radius_mm, thickness_mm);
-        (Vec3::from(points[i]) + (coarse.zero * cos + square * sin) * lift).into()
+        let z = f64::from(unrolled.across_mm[i]) - middle;
+        let lift = -drawn * shell_term(z, shell_mm);
+        (Vec3::from(points[i]) + coarse.outward(f64::from(unrolled.at[i])) * lift).into()
     })
     .collect()
-}
-
-/// The reference wall's cylinder by orthogonal distance, with what its arc allows: a free radius where it is determined
-/// to better than the pipe's delivery tolerance, else the nominal one.
-fn reference_frame(wall: &[[f64; 3]], coarse: &PipeFrame, nominal: &Nominal) -> Result<(PipeFrame, bool)> {
-    crate::error::require_count("points of the reference wall", 100, wall.len())?;
-    let sample: Vec<[f64; 3]> = wall.iter().step_by(wall.len().div_ceil(FIT_POINTS)).copied().collect();
-    let start = cylinder::Cylinder { point_mm: coarse.origin_mm, axis: coarse.axis, radius_mm: coarse.radius_mm };
-    let fixed = cylinder::refine(&sample, start, false, PointNoise::default())?.surface;
-    let free = cylinder::refine(&sample, fixed, true, PointNoise::default()).ok().filter(|fit| {
-        let last = fit.covariance.nrows() - 1;
-        let sigma = fit.covariance[(last, last)].sqrt();
-        // The residuals of a wall are correlated: their number counts for far less than it says, see `step`.
-        let doubt = sigma * (sample.len() as f64 / 100.0).sqrt();
-        doubt < DIAMETER_TOLERANCE * nominal.radius_mm
-    });
-    if let Some(fit) = &free
-        && (fit.surface.radius_mm / nominal.radius_mm - 1.0).abs() > OTHER_PIPE
-    {
-        let (seen, told) = (fit.surface.radius_mm, nominal.radius_mm);
-        let reason =
-            format!("the reference wall's radius is {seen:.1} mm, not {told:.1} mm as the part's description says");
-        return Err(Error::Degenerate { what: "pipe", reason });
-    }
-    let (surface, fitted) = free.map_or((fixed, false), |fit| (fit.surface, true));
-    let axis = if surface.axis.dot(&coarse.axis) < 0.0 { -surface.axis } else { surface.axis };
-    // The point of the axis next to the coarse origin.
-    let origin = surface.point_mm + axis * axis.dot(&(coarse.origin_mm - surface.point_mm));
-    Ok((PipeFrame::new(origin, axis, coarse.zero, surface.radius_mm)?, fitted))
 }
 
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::weld::seam::Course;
 
     /// A pipe's weld as a scanner sees it from outside, made point by point from the closed form, not by the simulator.
     #[derive(Clone, Copy)]
@@ -317,28 +277,23 @@ pub(crate) mod tests {
         }
 
         /// The axis runs along +x of the scanner, whose z looks at the pipe; angle 0 is `zero`.
-        pub(crate) fn frame(&self) -> PipeFrame {
+        pub(crate) fn frame(&self) -> Seam {
             let origin = Vec3::new(3.0, -2.0, 420.0 + self.radius_mm);
             let toward = Vec3::new(0.0, 0.0, -1.0);
             let axis = Vec3::x();
             // zero turned by MIDDLE_RAD about the axis is `toward`.
             let zero = toward * MIDDLE_RAD.cos() - axis.cross(&toward) * MIDDLE_RAD.sin();
-            PipeFrame::new(origin, axis, zero, self.radius_mm).unwrap()
+            Seam::new(origin, axis, zero, Course::of_radius(self.radius_mm).unwrap()).unwrap()
         }
 
         pub(crate) fn nominal(&self) -> Nominal {
             let frame = self.frame();
-            Nominal {
-                radius_mm: self.radius_mm,
-                wall_thickness_mm: 6.0,
-                axis: Some(frame.axis),
-                zero: Some(frame.zero),
-            }
+            Nominal { course: frame.course, wall_thickness_mm: 6.0, axis: Some(frame.across), zero: Some(frame.zero) }
         }
 
         pub(crate) fn points(&self) -> Vec<[f64; 3]> {
             let frame = self.frame();
-            let square = frame.axis.cross(&frame.zero);
+            let square = frame.square();
             let mut state = self.seed;
             let mut points = Vec::new();
             for r in 0..ROWS {
@@ -355,7 +310,7 @@ pub(crate) mod tests {
                     }
                     let radius = self.radius_mm + height + self.noise_mm * normal_random(&mut state);
                     let p = frame.origin_mm
-                        + frame.axis * axial
+                        + frame.across * axial
                         + (frame.zero * angle.cos() + square * angle.sin()) * radius;
                     points.push(p.into());
                 }
@@ -385,7 +340,7 @@ pub(crate) mod tests {
             ];
             assert!(shares.iter().all(|s| *s > 0.99), "R {radius_mm}: {shares:?}");
             assert!(share(&s.labels, Label::Bead, |z| z.abs() > half + 8.0, &e) < 0.01, "R {radius_mm}");
-            assert!(s.frame.origin_mm.x - 3.0 < 0.5 && s.frame.axis.dot(&Vec3::x()) > 0.999_99, "R {radius_mm}");
+            assert!(s.seam.origin_mm.x - 3.0 < 0.5 && s.seam.across.dot(&Vec3::x()) > 0.999_99, "R {radius_mm}");
         }
     }
 
@@ -394,9 +349,9 @@ pub(crate) mod tests {
         let e = EXAMPLE;
         let nominal = Nominal { axis: None, zero: None, ..e.nominal() };
         let s = segment(&e.points(), COLUMNS, &nominal).unwrap();
-        assert!(s.frame.axis.dot(&Vec3::x()) > 0.999_99);
+        assert!(s.seam.across.dot(&Vec3::x()) > 0.999_99);
         // Angle 0 faces the scanner.
-        assert!(s.frame.zero.dot(&Vec3::new(0.0, 0.0, -1.0)) > 0.999);
+        assert!(s.seam.zero.dot(&Vec3::new(0.0, 0.0, -1.0)) > 0.999);
     }
 
     #[test]
@@ -430,7 +385,7 @@ pub(crate) mod tests {
         assert!(segment(&[[f64::NAN; 3]; 10_000], 100, &nominal).is_err());
         assert!(segment(&[[1.0; 3]; 10_000], 100, &nominal).is_err());
         assert!(segment(&EXAMPLE.points(), 7, &nominal).is_err());
-        assert!(segment(&EXAMPLE.points(), COLUMNS, &Nominal { radius_mm: -1.0, ..nominal }).is_err());
+        assert!(segment(&EXAMPLE.points(), COLUMNS, &Nominal { wall_thickness_mm: -1.0, ..nominal }).is_err());
         let mut state = 3;
         let noise: Vec<[f64; 3]> =
             (0..40_000).map(|_| std::array::from_fn(|_| 400.0 * normal_random(&mut state))).collect();

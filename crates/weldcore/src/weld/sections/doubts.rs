@@ -62,7 +62,7 @@ impl View<'_> {
         let part = |n: usize| n as f64 / seen.max(1) as f64;
         let worth = |s: &Station| s.toes_mm.map_or(0.0, |t| t[1] - t[0]);
         let mut say = |code: &'static str, at: usize, text: String| {
-            doubts.push(Doubt { code, angle_rad: stations[at].angle_rad, text });
+            doubts.push(Doubt { code, at: stations[at].at, text });
         };
         let worst = |wrong: &[(usize, f64)]| wrong.iter().max_by(|a, b| a.1.total_cmp(&b.1)).copied();
         let among = |of: &Measure| -> Wrong {
@@ -154,7 +154,7 @@ impl View<'_> {
                     format!("the {name} is not seen undisturbed{where_from}: what it was before the weld is not known"),
                 );
             }
-            let shell = SHELL_LENGTHS * (self.grid.radius_mm * self.thickness_mm).sqrt();
+            let shell = SHELL_LENGTHS * self.grid.course.shell_mm(self.thickness_mm).unwrap_or(0.0);
             let off = among(&|_, s| {
                 let (run, toes) = (s.walls[side]?, s.toes_mm?);
                 let length = run.from - if side == 0 { -toes[0] } else { toes[1] };

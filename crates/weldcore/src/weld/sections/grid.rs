@@ -5,14 +5,8 @@ use rayon::prelude::*;
 use crate::error::{Error, Result, require_count};
 use crate::ground::robust::{MEDIAN_TO_SIGMA, median, median_between};
 use crate::ground::threads;
-use crate::weld::pipe_frame::{PipeFrame, Unrolled};
+use crate::weld::seam::{Course, Unrolled};
 
-/// Length of a station along the seam: short enough that a dent of two degrees on a large pipe fills one, long enough
-/// for several points a bin.
-const STATION_MM: f64 = 4.0;
-/// The same on a pipe of less than 50 mm radius, whose arcs are short.
-const SMALL_STATION_MM: f64 = 2.5;
-const SMALL_RADIUS_MM: f64 = 50.0;
 /// Bins across the seam, in point spacings, and their least and largest width: a toe is placed to about a bin.
 const BIN_SPACINGS: f64 = 0.8;
 const BIN_MM: [f64; 2] = [0.2, 0.8];
@@ -32,16 +26,16 @@ pub(crate) struct Place {
     pub along: f64,
     /// Across the seam, mm.
     pub across: f64,
-    /// Height over the frame's cylinder, mm.
+    /// Height over the frame's surface, mm.
     pub height: f64,
 }
 
 /// Stations by bins with medians.
 #[derive(Debug, Clone)]
 pub(crate) struct Grid {
-    /// Angle of the middle of the view.
-    pub middle_rad: f64,
-    pub radius_mm: f64,
+    /// The middle of the view, in the seam's parameter.
+    pub middle: f64,
+    pub course: Course,
     pub start_along: f64,
     pub station_mm: f64,
     pub stations: usize,
@@ -57,21 +51,17 @@ pub(crate) struct Grid {
 }
 
 impl Grid {
-    /// Cells of all points at the angles where the pipe is; `near_mm` tells which points are the pipe's when the extent of
+    /// Cells of all points where the part is; `near_mm` tells which points are the part's when the extent of
     /// the view is sought (a cell takes points of any height: a deep dent is one of the part's places too).
-    pub fn of(unrolled: &Unrolled, frame: &PipeFrame, near_mm: f64) -> Result<Self> {
-        let near = |i: usize| f64::from(unrolled.deviation_mm[i].abs()) < near_mm;
-        let n = unrolled.deviation_mm.len();
-        let count = unrolled.deviation_mm.iter().filter(|d| f64::from(d.abs()) < near_mm).count();
+    pub fn of(unrolled: &Unrolled, course: Course, near_mm: f64) -> Result<Self> {
+        let near = |i: usize| f64::from(unrolled.height_mm[i].abs()) < near_mm;
+        let n = unrolled.height_mm.len();
+        let count = unrolled.height_mm.iter().filter(|d| f64::from(d.abs()) < near_mm).count();
         require_count("part points near the nominal pipe", 1000, count)?;
-        let (mut c, mut s) = (0.0, 0.0);
-        for i in (0..n).step_by(RANGE_STRIDE).filter(|&i| near(i)) {
-            let (sin, cos) = unrolled.angle_rad[i].sin_cos();
-            (c, s) = (c + f64::from(cos), s + f64::from(sin));
-        }
+        let some = || (0..n).step_by(RANGE_STRIDE).filter(|&i| near(i));
         let mut grid = Self {
-            middle_rad: s.atan2(c),
-            radius_mm: frame.radius_mm,
+            middle: course.middle(some().map(|i| unrolled.at[i])),
+            course,
             start_along: 0.0,
             station_mm: 1.0,
             stations: 1,
@@ -82,15 +72,14 @@ impl Grid {
             noise_mm: 0.0,
             cell_sigma_mm: 0.0,
         };
-        let places = (0..n).step_by(RANGE_STRIDE).filter(|&i| near(i)).map(|i| grid.place(unrolled, i));
+        let places = some().map(|i| grid.place(unrolled, i));
         let (along, across): (Vec<f64>, Vec<f64>) = places.map(|p| (p.along, p.across)).unzip();
         let (along, across) = (inner_range(along), inner_range(across));
         let spacing = ((along.1 - along.0) * (across.1 - across.0) / count as f64).sqrt();
         if !(spacing.is_finite() && spacing > 0.0) {
             return Err(Error::Degenerate { what: "part", reason: "its points span no surface".into() });
         }
-        let wanted = if frame.radius_mm < SMALL_RADIUS_MM { SMALL_STATION_MM } else { STATION_MM };
-        grid.stations = (((along.1 - along.0) / wanted).round() as usize).clamp(1, 4096);
+        grid.stations = (((along.1 - along.0) / course.station_mm()).round() as usize).clamp(1, 4096);
         grid.station_mm = (along.1 - along.0) / grid.stations as f64;
         grid.start_along = along.0;
         let filled = POINTS_PER_CELL * spacing * spacing / grid.station_mm;
@@ -104,12 +93,10 @@ impl Grid {
 
     #[inline]
     pub fn place(&self, unrolled: &Unrolled, i: usize) -> Place {
-        let turn = f64::from(unrolled.angle_rad[i]) - self.middle_rad;
-        let turn = turn - (turn / std::f64::consts::TAU).round() * std::f64::consts::TAU;
         Place {
-            along: turn * self.radius_mm,
-            across: f64::from(unrolled.axial_mm[i]),
-            height: f64::from(unrolled.deviation_mm[i]),
+            along: self.course.along_mm(self.course.apart(f64::from(unrolled.at[i]), self.middle)),
+            across: f64::from(unrolled.across_mm[i]),
+            height: f64::from(unrolled.height_mm[i]),
         }
     }
 
@@ -132,9 +119,9 @@ impl Grid {
         (k >= 0.0 && k < self.bins as f64).then_some(k as usize)
     }
 
-    /// Middle of a station, as an angle of the frame.
-    pub fn angle_rad(&self, station: usize) -> f64 {
-        self.middle_rad + (self.start_along + (station as f64 + 0.5) * self.station_mm) / self.radius_mm
+    /// Middle of a station, in the seam's parameter.
+    pub fn at(&self, station: usize) -> f64 {
+        self.middle + self.course.difference(self.start_along + (station as f64 + 0.5) * self.station_mm)
     }
 
     /// Heights of one station.
@@ -165,7 +152,7 @@ impl Grid {
             Some((self.station(p.along)? * self.bins + self.bin(p.across)?, p.height as f32))
         };
         let mut starts = vec![0_usize; cells + 1];
-        let found: Vec<Vec<(u32, f32)>> = threads::map_ranges(unrolled.angle_rad.len(), |range| {
+        let found: Vec<Vec<(u32, f32)>> = threads::map_ranges(unrolled.at.len(), |range| {
             range.filter_map(|i| cell_of(i).map(|(k, d)| (k as u32, d))).collect()
         });
         for (cell, _) in found.iter().flatten() {

@@ -29,7 +29,7 @@ pub use station::{Doubt, Edge, Kind, Station};
 pub(crate) use walls::WallRun;
 pub(crate) use walls::{TOLERANCE_MM, shell_term};
 
-use super::pipe_frame::{PipeFrame, Unrolled};
+use super::seam::{Course, Unrolled};
 use crate::error::{Error, Result};
 use crate::ground::robust::median;
 use view::View;
@@ -52,14 +52,14 @@ pub struct Sections {
     pub noise_mm: f64,
 }
 
-/// Examines an unrolled view of a pipe with walls of `thickness_mm`; `near_mm` is how far from the nominal pipe points are its
+/// Examines an unrolled view of a seam between walls of `thickness_mm`; `near_mm` is how far from the nominal part points are its
 /// own beyond doubt.
 ///
 /// # Errors
 /// [`Error::TooFew`] and [`Error::Degenerate`] where there is next to nothing; [`Error::NotFound`] where no weld, or only one
 /// wall, is in view.
-pub fn examine(unrolled: &Unrolled, frame: &PipeFrame, thickness_mm: f64, near_mm: f64) -> Result<Sections> {
-    let grid = Grid::of(unrolled, frame, near_mm)?;
+pub fn examine(unrolled: &Unrolled, course: Course, thickness_mm: f64, near_mm: f64) -> Result<Sections> {
+    let grid = Grid::of(unrolled, course, near_mm)?;
     let view = View::of(&grid, thickness_mm);
     let found = view.weld()?;
     let stations = view.stations(&found);

@@ -132,7 +132,7 @@ impl View<'_> {
             near(0) && near(1)
         };
         let mut station = Station {
-            angle_rad: self.grid.angle_rad(k),
+            at: self.grid.at(k),
             seen,
             kind: found.kind,
             by_course,
@@ -147,7 +147,7 @@ impl View<'_> {
         if !seen {
             return (station, [None; 2]);
         }
-        let shell = [self.grid.radius_mm, self.thickness_mm];
+        let shell = self.grid.course.shell_mm(self.thickness_mm);
         let centre = 0.5 * (toes[0].at + toes[1].at);
         station.toes_mm = Some([toes[0].at, toes[1].at]);
         for (side, toe) in toes.iter().enumerate() {

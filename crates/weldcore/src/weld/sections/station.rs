@@ -41,8 +41,8 @@ impl Edge {
 /// One station.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Station {
-    /// Its middle.
-    pub angle_rad: f64,
+    /// Its middle, in the seam's parameter.
+    pub at: f64,
     /// Whether enough points lie near the weld.
     pub seen: bool,
     /// How its weld shows.
@@ -74,7 +74,7 @@ impl Station {
         self.walls[side].map(|run| run.straight(if side == 0 { -x } else { x }))
     }
 
-    /// Slope of a side's straight wall along the axis.
+    /// Slope of a side's straight wall across the seam.
     pub(super) fn slope(&self, side: usize) -> Option<f64> {
         self.walls[side].map(|run| if side == 0 { -run.slope } else { run.slope })
     }
@@ -85,8 +85,8 @@ impl Station {
 pub struct Doubt {
     /// `cap`, `edges`, `transition`, `walls` or `points-without-wall`.
     pub code: &'static str,
-    /// Where.
-    pub angle_rad: f64,
+    /// Where, in the seam's parameter.
+    pub at: f64,
     /// What, with numbers.
     pub text: String,
 }

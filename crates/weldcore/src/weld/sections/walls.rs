@@ -23,9 +23,10 @@ const BLOCK_MM: f64 = 3.0;
 /// Unevenness counts as one value per this length: drawn and rolled walls wave over centimetres.
 const WAVE_MM: f64 = 15.0;
 
-/// Timoshenko's shell term at a distance from the ring that draws it in.
-pub(crate) fn shell_term(distance_mm: f64, radius_mm: f64, thickness_mm: f64) -> f64 {
-    let x = 1.285 * distance_mm.abs() / (radius_mm * thickness_mm).sqrt();
+/// Timoshenko's shell term at a distance from the ring that draws it in; `shell_mm` is `√(R t)`. Without a ring there is none.
+pub(crate) fn shell_term(distance_mm: f64, shell_mm: Option<f64>) -> f64 {
+    let Some(shell_mm) = shell_mm else { return 0.0 };
+    let x = 1.285 * distance_mm.abs() / shell_mm;
     (-x).exp() * (x.cos() + x.sin())
 }
 
@@ -44,7 +45,7 @@ pub(crate) struct WallRun {
     /// Standard uncertainty of the slope.
     pub slope_u: f64,
     pub(crate) centre: f64,
-    pub(crate) shell_mm: [f64; 2],
+    pub(crate) shell_mm: Option<f64>,
 }
 
 impl WallRun {
@@ -55,7 +56,7 @@ impl WallRun {
 
     /// The wall with its shrinkage.
     pub fn at(&self, x: f64) -> f64 {
-        self.straight(x) + self.shrinkage * shell_term(x - self.centre, self.shell_mm[0], self.shell_mm[1])
+        self.straight(x) + self.shrinkage * shell_term(x - self.centre, self.shell_mm)
     }
 }
 
@@ -66,7 +67,7 @@ pub(super) fn tolerance(sigma: f64) -> f64 {
 }
 
 /// Grows the wall to the right of `toe` from the edge of the view; `None` where no stretch of it is one.
-pub(super) fn grow(profile: &Profile, toe: f64, centre: f64, shell_mm: [f64; 2], sigma: f64) -> Option<WallRun> {
+pub(super) fn grow(profile: &Profile, toe: f64, centre: f64, shell_mm: Option<f64>, sigma: f64) -> Option<WallRun> {
     let side = Side::of(profile, toe, centre, shell_mm);
     let end = profile.edge(side.bins.last()?.index + 1);
     let tolerance = tolerance(sigma);
@@ -109,14 +110,14 @@ struct Side<'a> {
     profile: &'a Profile,
     bins: Vec<SideBin>,
     centre: f64,
-    shell_mm: [f64; 2],
+    shell_mm: Option<f64>,
 }
 
 impl<'a> Side<'a> {
-    fn of(profile: &'a Profile, toe: f64, centre: f64, shell_mm: [f64; 2]) -> Self {
+    fn of(profile: &'a Profile, toe: f64, centre: f64, shell_mm: Option<f64>) -> Self {
         let one = |index: usize| {
             let z = profile.x(index) - centre;
-            SideBin { index, z, height: profile.heights[index], shell: shell_term(z, shell_mm[0], shell_mm[1]) }
+            SideBin { index, z, height: profile.heights[index], shell: shell_term(z, shell_mm) }
         };
         let bins = (profile.boundary(toe)..profile.len()).map(one).filter(|b| b.height.is_finite()).collect();
         Self { profile, bins, centre, shell_mm }

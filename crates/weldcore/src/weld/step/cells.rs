@@ -7,10 +7,11 @@ use crate::ground::robust::median;
 use crate::ground::stop::polled;
 use crate::ground::threads;
 use crate::weld::label::Label;
+use crate::weld::seam::{Course, Unrolled};
 
 /// Cells per wall and shot: enough to see the unevenness's correlation, few enough to handle their covariance whole.
 const CELLS_PER_WALL: f64 = 700.0;
-/// Every so many points tell where the middle of an arc is.
+/// Every so many points tell where the middle of a stretch is.
 const MIDDLE_STRIDE: usize = 16;
 /// A cell needs this part of the points of a typical cell.
 const FULL_PART: f64 = 0.25;
@@ -18,16 +19,12 @@ const FULL_PART: f64 = 0.25;
 /// One shot, unrolled and labelled (see [`crate::weld::segment`]).
 #[derive(Debug, Clone, Copy)]
 pub struct LabelledShot<'a> {
-    /// Angle about the axis, rad; NaN where there is no point.
-    pub angle_rad: &'a [f32],
-    /// From the seam's centreline, mm; the reference wall is negative.
-    pub axial_mm: &'a [f32],
-    /// Radial deviation from the reference wall's cylinder, mm.
-    pub deviation_mm: &'a [f32],
+    /// The points in the seam's frame, across from its centreline.
+    pub unrolled: &'a Unrolled,
     /// A [`Label`] per point.
     pub labels: &'a [u8],
-    /// Radius of the reference wall.
-    pub radius_mm: f64,
+    /// How the seam runs.
+    pub course: Course,
     /// Distance between the toes.
     pub bead_width_mm: f64,
     /// Of the nominal wall.
@@ -38,23 +35,22 @@ pub struct LabelledShot<'a> {
 pub(super) struct Cell {
     pub(super) shot: usize,
     pub(super) other: bool,
-    pub(super) angle: f64,
-    pub(super) axial: f64,
-    pub(super) deviation: f64,
+    pub(super) at: f64,
+    pub(super) across: f64,
+    pub(super) height: f64,
 }
 
-/// The arc of one shot: angles are counted from its middle.
+/// The stretch of the seam that one shot saw: places are counted from its middle.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Arc {
+pub(super) struct Stretch {
     pub(super) middle: f64,
     pub(super) half: f64,
-    pub(super) radius_mm: f64,
+    pub(super) course: Course,
 }
 
-impl Arc {
-    pub(super) fn local(&self, angle: f64) -> f64 {
-        let turn = angle - self.middle;
-        turn - (turn / std::f64::consts::TAU).round() * std::f64::consts::TAU
+impl Stretch {
+    pub(super) fn local(&self, at: f64) -> f64 {
+        self.course.apart(at, self.middle)
     }
 }
 
@@ -72,53 +68,46 @@ pub(super) fn is_wall(label: u8) -> Option<bool> {
     }
 }
 
-/// The arc of a shot's walls, from the middle of what was seen of them.
-pub(super) fn arc_of(shot: &LabelledShot) -> Result<Arc> {
-    let (mut c, mut s, mut count) = (0.0, 0.0, [0_usize; 2]);
-    for (i, (a, l)) in shot.angle_rad.iter().zip(shot.labels).enumerate() {
-        if let Some(other) = is_wall(*l) {
-            // Any angle about the middle will do to count from.
-            if i % MIDDLE_STRIDE == 0 {
-                let (sin, cos) = a.sin_cos();
-                (c, s) = (c + f64::from(cos), s + f64::from(sin));
-            }
-            count[usize::from(other)] += 1;
-        }
-    }
+/// The stretch of a shot's walls, from the middle of what was seen of them.
+pub(super) fn stretch_of(shot: &LabelledShot) -> Result<Stretch> {
+    let mut count = [0_usize; 2];
+    shot.labels.iter().filter_map(|l| is_wall(*l)).for_each(|other| count[usize::from(other)] += 1);
     for (what, n) in [("points of the reference wall", count[0]), ("points of the other wall", count[1])] {
         require_count(what, 100, n)?;
     }
-    let mut arc = Arc { middle: f64::atan2(s, c), half: 0.0, radius_mm: shot.radius_mm };
-    for (a, l) in shot.angle_rad.iter().zip(shot.labels) {
-        if is_wall(*l).is_some() {
-            arc.half = arc.half.max(arc.local(f64::from(*a)).abs());
-        }
+    let walls = || shot.unrolled.at.iter().zip(shot.labels).enumerate().filter(|(_, (_, l))| is_wall(**l).is_some());
+    // Any place about the middle will do to count from.
+    let some = walls().filter(|(i, _)| i % MIDDLE_STRIDE == 0).map(|(_, (at, _))| *at);
+    let mut stretch = Stretch { middle: shot.course.middle(some), half: 0.0, course: shot.course };
+    for (_, (at, _)) in walls() {
+        stretch.half = stretch.half.max(stretch.local(f64::from(*at)).abs());
     }
-    if arc.half <= 0.0 {
+    if stretch.half <= 0.0 {
         return Err(Error::Degenerate { what: "step", reason: "all points lie at one angle".into() });
     }
-    Ok(arc)
+    Ok(stretch)
 }
 
-pub(super) fn grid_of(index: usize, shot: &LabelledShot, arc: &Arc) -> Result<WallGrid> {
+pub(super) fn grid_of(index: usize, shot: &LabelledShot, stretch: &Stretch) -> Result<WallGrid> {
     let mut low = [f64::INFINITY; 2];
     let mut high = [f64::NEG_INFINITY; 2];
-    for (z, l) in shot.axial_mm.iter().zip(shot.labels) {
+    for (z, l) in shot.unrolled.across_mm.iter().zip(shot.labels) {
         if let Some(other) = is_wall(*l) {
             let k = usize::from(other);
             low[k] = low[k].min(f64::from(*z));
             high[k] = high[k].max(f64::from(*z));
         }
     }
-    let area = 2.0 * arc.half * arc.radius_mm * (high[0] - low[0]).max(high[1] - low[1]);
+    let length_mm = stretch.course.along_mm(2.0 * stretch.half);
+    let area = length_mm * (high[0] - low[0]).max(high[1] - low[1]);
     let cell_mm = (area / CELLS_PER_WALL).sqrt();
     if !(cell_mm.is_finite() && cell_mm > 0.0) {
         return Err(Error::Degenerate { what: "step", reason: "the walls have no extent".into() });
     }
-    let columns = (2.0 * arc.half * arc.radius_mm / cell_mm) as usize + 1;
+    let columns = (length_mm / cell_mm) as usize + 1;
     let rows: [usize; 2] = std::array::from_fn(|k| ((high[k] - low[k]) / cell_mm) as usize + 1);
     let total = columns * (rows[0] + rows[1]);
-    // Angle, axial, deviation, count; one partial grid per large chunk, added in order.
+    // Along, across, height, count; one partial grid per large chunk, added in order.
     let indices: Vec<usize> = (0..shot.labels.len()).collect();
     let parts: Vec<Vec<[f64; 4]>> = threads::install(|| {
         indices
@@ -129,11 +118,11 @@ pub(super) fn grid_of(index: usize, shot: &LabelledShot, arc: &Arc) -> Result<Wa
                 for &i in chunk {
                     let Some(other) = is_wall(shot.labels[i]) else { continue };
                     let k = usize::from(other);
-                    let (a, z) = (arc.local(f64::from(shot.angle_rad[i])), f64::from(shot.axial_mm[i]));
-                    let column = (((a + arc.half) * arc.radius_mm / cell_mm) as usize).min(columns - 1);
+                    let (a, z) = (stretch.local(f64::from(shot.unrolled.at[i])), f64::from(shot.unrolled.across_mm[i]));
+                    let column = ((stretch.course.along_mm(a + stretch.half) / cell_mm) as usize).min(columns - 1);
                     let row = (((z - low[k]) / cell_mm) as usize).min(rows[k] - 1);
                     let slot = &mut sums[columns * (k * rows[0] + row) + column];
-                    let d = f64::from(shot.deviation_mm[i]);
+                    let d = f64::from(shot.unrolled.height_mm[i]);
                     *slot = [slot[0] + a, slot[1] + z, slot[2] + d, slot[3] + 1.0];
                 }
                 sums
@@ -152,12 +141,12 @@ pub(super) fn grid_of(index: usize, shot: &LabelledShot, arc: &Arc) -> Result<Wa
         (s[3] > 0.0 && s[3] >= full).then(|| Cell {
             shot: index,
             other: k >= columns * rows[0],
-            angle: arc.middle + s[0] / s[3],
-            axial: s[1] / s[3],
-            deviation: s[2] / s[3],
+            at: stretch.middle + s[0] / s[3],
+            across: s[1] / s[3],
+            height: s[2] / s[3],
         })
     };
-    // Wall by wall, and around the axis: neighbours in the list are neighbours on the wall, see `Whitener`.
+    // Wall by wall, and along the seam: neighbours in the list are neighbours on the wall, see `Whitener`.
     let place = |k: usize, c: usize, r: usize| columns * (k * rows[0] + r) + c;
     let turned = (0..2).flat_map(|k| (0..columns).flat_map(move |c| (0..rows[k]).map(move |r| place(k, c, r))));
     Ok(WallGrid { cells: turned.filter_map(|i| cell((i, &sums[i]))).collect(), cell_mm })

@@ -22,7 +22,7 @@ pub(super) struct Solution {
     pub(super) residuals: Vec<f64>,
 }
 
-/// Generalised least squares: rows and deviations are whitened first.
+/// Generalised least squares: rows and heights are whitened first.
 pub(super) fn solve(model: &Model, cells: &[Cell], whitener: &Whitener) -> Result<Solution> {
     let degenerate = |reason: &str| Error::Degenerate { what: "step", reason: reason.into() };
     let columns = model.columns();
@@ -49,10 +49,10 @@ pub(super) fn solve(model: &Model, cells: &[Cell], whitener: &Whitener) -> Resul
     let inverse = r
         .solve_upper_triangular(&DMatrix::identity(columns, columns))
         .ok_or_else(|| degenerate("the walls do not determine it"))?;
-    let deviations = DVector::from_iterator(cells.len(), cells.iter().map(|c| c.deviation));
+    let heights = DVector::from_iterator(cells.len(), cells.iter().map(|c| c.height));
     // The second-order term of h depends on the answer: three rounds leave 1e-9 mm.
     let mut parameters = DVector::zeros(columns);
-    let mut bent = deviations.clone();
+    let mut bent = heights.clone();
     for _ in 0..3 {
         let mut white = bent.clone();
         whitener.apply(white.as_mut_slice());
@@ -60,7 +60,7 @@ pub(super) fn solve(model: &Model, cells: &[Cell], whitener: &Whitener) -> Resul
         parameters = &inverse * (q.tr_mul(&white));
         for (i, cell) in cells.iter().enumerate() {
             bent[i] =
-                deviations[i] + if cell.other { second_order(model, &parameters, cell.angle, cell.axial) } else { 0.0 };
+                heights[i] + if cell.other { second_order(model, &parameters, cell.at, cell.across) } else { 0.0 };
         }
     }
     let residuals = &bent - &rows * &parameters;
@@ -78,8 +78,8 @@ pub(super) fn solve(model: &Model, cells: &[Cell], whitener: &Whitener) -> Resul
 /// Adds groups of terms to the plain offset as long as Schwarz's criterion falls.
 pub(super) fn choose<'a>(model: &impl Fn(Terms) -> Model<'a>, cells: &[Cell], whitener: &Whitener) -> Result<Terms> {
     let count = cells.len() as f64;
-    let mut terms = Terms { radius: false, tilt: false, shape: 2, shell: false };
-    let full = model(Terms { radius: true, tilt: true, shape: MAX_SHAPE_DEGREE, shell: true });
+    let mut terms = Terms { curvature: false, tilt: false, shape: 2, shell: false };
+    let full = model(Terms { curvature: true, tilt: true, shape: MAX_SHAPE_DEGREE, shell: true });
     let normal = Normal::of(&full, cells, whitener, &solve(&model(terms), cells, whitener)?.residuals);
     let criterion = |terms: Terms| -> Option<f64> {
         let columns = full.columns_with(terms);
@@ -89,7 +89,7 @@ pub(super) fn choose<'a>(model: &impl Fn(Terms) -> Model<'a>, cells: &[Cell], wh
     let mut best = criterion(terms).unwrap_or(f64::INFINITY);
     loop {
         let mut candidates =
-            vec![Terms { radius: true, ..terms }, Terms { tilt: true, ..terms }, Terms { shell: true, ..terms }];
+            vec![Terms { curvature: true, ..terms }, Terms { tilt: true, ..terms }, Terms { shell: true, ..terms }];
         // Ovality is even: a step of one degree alone may not pay.
         candidates
             .extend((terms.shape + 1..=(terms.shape + 2).min(MAX_SHAPE_DEGREE)).map(|shape| Terms { shape, ..terms }));
@@ -114,8 +114,8 @@ type Part = (Vec<usize>, DMatrix<f64>, DVector<f64>, f64);
 
 impl Normal {
     fn of(model: &Model, cells: &[Cell], whitener: &Whitener, residuals: &[f64]) -> Self {
-        let starts: Vec<usize> = (0..=model.arcs.len()).map(|k| cells.partition_point(|c| c.shot < k)).collect();
-        let shots: Vec<usize> = (0..model.arcs.len()).collect();
+        let starts: Vec<usize> = (0..=model.stretches.len()).map(|k| cells.partition_point(|c| c.shot < k)).collect();
+        let shots: Vec<usize> = (0..model.stretches.len()).collect();
         // The columns of another shot are zero in a shot's rows, and whitening stays within a shot.
         let parts: Vec<Part> = threads::install(|| {
             shots

@@ -1,6 +1,5 @@
 //! The step of welds whose closed form is known.
 
-use super::profile::BIN_DEG;
 use super::*;
 use crate::ground::threads;
 use crate::weld::label::Label;
@@ -13,11 +12,9 @@ const STEP_TOLERANCE_MM: f64 = 0.006;
 
 fn shot(s: &Segmentation) -> LabelledShot<'_> {
     LabelledShot {
-        angle_rad: &s.unrolled.angle_rad,
-        axial_mm: &s.unrolled.axial_mm,
-        deviation_mm: &s.unrolled.deviation_mm,
+        unrolled: &s.unrolled,
         labels: &s.labels,
-        radius_mm: s.frame.radius_mm,
+        course: s.seam.course,
         bead_width_mm: s.bead_width_mm,
         thickness_mm: s.thickness_mm,
     }
@@ -32,7 +29,7 @@ fn measured(examples: &[Example]) -> (Vec<Segmentation>, Step) {
 }
 
 fn largest_error(step: &Step, e: &Example) -> f64 {
-    let error = |b: &ProfileBin| (b.step_mm - e.step_mm(b.seen_at_deg.to_radians(), 0.0)).abs();
+    let error = |b: &ProfileBin| (b.step_mm - e.step_mm(b.seen_along.to_radians(), 0.0)).abs();
     step.profile.iter().map(error).fold(0.0, f64::max)
 }
 
@@ -48,11 +45,11 @@ fn the_step_is_that_of_the_closed_form() {
         let (_, step) = measured(&[e]);
         assert!(largest_error(&step, &e) < STEP_TOLERANCE_MM, "R {}: {} mm", e.radius_mm, largest_error(&step, &e));
         for bin in &step.profile {
-            let error = bin.step_mm - e.step_mm(bin.seen_at_deg.to_radians(), 0.0);
-            assert!(error.abs() < 4.0 * bin.standard_mm, "{error} mm at {}", bin.angle_deg);
+            let error = bin.step_mm - e.step_mm(bin.seen_along.to_radians(), 0.0);
+            assert!(error.abs() < 4.0 * bin.standard_mm, "{error} mm at {}", bin.along);
         }
         let arc_deg = 2.0 * e.half_arc_rad.to_degrees();
-        assert!((step.coverage_deg - arc_deg).abs() <= 2.0 * BIN_DEG, "{} deg", step.coverage_deg);
+        assert!((step.coverage - arc_deg).abs() <= 2.0 * e.frame().course.bin_width(), "{} deg", step.coverage);
     }
 }
 
@@ -70,9 +67,9 @@ fn a_dent_beside_the_seam_is_not_smoothed_away() {
     let mut s = segment(&e.points(), COLUMNS, &e.nominal()).unwrap();
     // Six degrees of the other wall stand 0.5 mm higher.
     for i in 0..s.labels.len() {
-        let turn = f64::from(s.unrolled.angle_rad[i]) - MIDDLE_RAD;
-        if s.unrolled.axial_mm[i] > 0.0 && (0.05..0.155).contains(&turn) {
-            s.unrolled.deviation_mm[i] += 0.5;
+        let turn = f64::from(s.unrolled.at[i]) - MIDDLE_RAD;
+        if s.unrolled.across_mm[i] > 0.0 && (0.05..0.155).contains(&turn) {
+            s.unrolled.height_mm[i] += 0.5;
         }
     }
     let step = measure(&[shot(&s)], &Known::default()).unwrap();
@@ -97,14 +94,14 @@ fn the_interval_covers_the_error_of_correlated_walls() {
             })
             .collect();
         for i in 0..s.labels.len() {
-            let (x, z) = (f64::from(s.unrolled.angle_rad[i]) * e.radius_mm, f64::from(s.unrolled.axial_mm[i]));
+            let (x, z) = (f64::from(s.unrolled.at[i]) * e.radius_mm, f64::from(s.unrolled.across_mm[i]));
             let wave: f64 = waves.iter().map(|w| (w[0] * x + w[1] * z + w[2]).cos()).sum();
-            s.unrolled.deviation_mm[i] += (0.01 * wave * (2.0 / 60.0_f64).sqrt()) as f32;
+            s.unrolled.height_mm[i] += (0.01 * wave * (2.0 / 60.0_f64).sqrt()) as f32;
         }
         let step = measure(&[shot(&s)], &Known::default()).unwrap();
         assert!(step.correlation_mm.iter().all(|l| (5.0..60.0).contains(l)), "{:?} mm", step.correlation_mm);
         for bin in step.profile.iter().step_by(5) {
-            let error = bin.step_mm - e.step_mm(bin.seen_at_deg.to_radians(), 0.0);
+            let error = bin.step_mm - e.step_mm(bin.seen_along.to_radians(), 0.0);
             inside += usize::from(error.abs() <= 2.0 * bin.fit_mm.hypot(bin.toe_mm).hypot(bin.local_mm));
             total += 1;
         }

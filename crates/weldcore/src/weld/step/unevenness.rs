@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::cells::{Arc, Cell};
+use super::cells::{Cell, Stretch};
 use crate::ground::robust::{MEDIAN_TO_SIGMA, median};
 use crate::ground::stop::{poll, polled};
 use crate::ground::threads;
@@ -10,12 +10,12 @@ use crate::ground::threads;
 /// What walls depart from their model as a rule, before it is known of these.
 const USUAL_UNEVENNESS_MM: f64 = 0.02;
 
-/// The covariance of what a fit leaves: a nugget, and a part correlated over a support around and along the axis.
+/// The covariance of what a fit leaves: a nugget, and a part correlated over a support along and across the seam.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Covariance {
     pub(super) nugget: f64,
     pub(super) sill: f64,
-    /// Distance at which the correlation ends: around and along the axis.
+    /// Distance at which the correlation ends: along and across the seam.
     pub(super) support_mm: [f64; 2],
 }
 
@@ -27,10 +27,10 @@ pub(crate) fn wendland(r: f64) -> f64 {
 /// Lags of the empirical covariance, in cells.
 pub(super) const LAGS: usize = 16;
 
-/// Distance of two cells of one shot around and along the axis.
-pub(super) fn apart_mm(arcs: &[Arc], a: &Cell, b: &Cell) -> [f64; 2] {
-    let arc = &arcs[a.shot];
-    [((arc.local(a.angle) - arc.local(b.angle)) * arc.radius_mm).abs(), (a.axial - b.axial).abs()]
+/// Distance of two cells of one shot along and across the seam.
+pub(super) fn apart_mm(stretches: &[Stretch], a: &Cell, b: &Cell) -> [f64; 2] {
+    let stretch = &stretches[a.shot];
+    [stretch.course.along_mm(stretch.local(a.at) - stretch.local(b.at)).abs(), (a.across - b.across).abs()]
 }
 
 /// Whether unevenness may be common to two cells: they are of one wall in one shot.
@@ -39,8 +39,8 @@ pub(super) fn related(a: &Cell, b: &Cell) -> bool {
 }
 
 impl Covariance {
-    /// From the residuals: products of pairs, averaged by their lag around and along the axis.
-    pub(super) fn of(arcs: &[Arc], cells: &[Cell], residuals: &[f64], cell_mm: f64) -> Self {
+    /// From the residuals: products of pairs, averaged by their lag along and across the seam.
+    pub(super) fn of(stretches: &[Stretch], cells: &[Cell], residuals: &[f64], cell_mm: f64) -> Self {
         // A dent is not unevenness: it must not hide itself by raising what counts as usual.
         let mut sizes: Vec<f64> = residuals.iter().map(|r| r.abs()).collect();
         let limit = 3.0 * MEDIAN_TO_SIGMA * median(&mut sizes);
@@ -58,7 +58,7 @@ impl Covariance {
                             if !related(&cells[i], &cells[j]) {
                                 break;
                             }
-                            let d = apart_mm(arcs, &cells[i], &cells[j]);
+                            let d = apart_mm(stretches, &cells[i], &cells[j]);
                             for way in 0..2 {
                                 let lag = (d[way] / cell_mm).round() as usize;
                                 if lag > 0 && lag < LAGS && 2.0 * d[1 - way] < cell_mm {
@@ -82,28 +82,28 @@ impl Covariance {
         let seen = |way: usize| -> Vec<(f64, f64)> {
             lags[way].iter().filter(|l| l.0 > 0.0).map(|l| (l.1 / l.0, l.2 / l.0)).collect()
         };
-        let (around, along) = (seen(0), seen(1));
+        let (along, across) = (seen(0), seen(1));
         // The sill from the way in which the correlation reaches further.
-        let sill = [&around, &along].map(|lags| fitted_support(lags, cell_mm, None).1);
+        let sill = [&along, &across].map(|lags| fitted_support(lags, cell_mm, None).1);
         let sill = sill[0].max(sill[1]).clamp(0.0, variance);
-        let support_mm = [&around, &along].map(|lags| fitted_support(lags, cell_mm, Some(sill)).0);
+        let support_mm = [&along, &across].map(|lags| fitted_support(lags, cell_mm, Some(sill)).0);
         // A hundredth at least stays uncorrelated, which keeps the whitening stable.
         Self { nugget: (variance - sill).max(0.01 * variance).max(f64::MIN_POSITIVE), sill, support_mm }
     }
 
     /// Between two cells.
-    fn between(&self, arcs: &[Arc], a: &Cell, b: &Cell) -> f64 {
+    fn between(&self, stretches: &[Stretch], a: &Cell, b: &Cell) -> f64 {
         if !related(a, b) {
             return 0.0;
         }
-        let d = apart_mm(arcs, a, b);
+        let d = apart_mm(stretches, a, b);
         self.sill * wendland((d[0] / self.support_mm[0]).hypot(d[1] / self.support_mm[1]))
     }
 
     /// Variance of a weighted sum of cells.
-    pub(super) fn variance_of(&self, arcs: &[Arc], terms: &[(Cell, f64)]) -> f64 {
+    pub(super) fn variance_of(&self, stretches: &[Stretch], terms: &[(Cell, f64)]) -> f64 {
         let row = |(a, w): &(Cell, f64)| {
-            let pairs: f64 = terms.iter().map(|(b, v)| v * self.between(arcs, a, b)).sum();
+            let pairs: f64 = terms.iter().map(|(b, v)| v * self.between(stretches, a, b)).sum();
             w * (pairs + w * self.nugget)
         };
         terms.iter().map(row).sum::<f64>().max(0.0)
@@ -128,7 +128,7 @@ pub(super) fn fitted_support(lags: &[(f64, f64)], cell_mm: f64, sill: Option<f64
 }
 
 /// Cholesky factor of the cells' covariance, row by row from the first column that is not zero: cells far apart are not
-/// correlated, and in their order around the axis that leaves a narrow band.
+/// correlated, and in their order along the seam that leaves a narrow band.
 pub(super) struct Whitener {
     pub(super) rows: Vec<(usize, Vec<f64>)>,
     /// What a whitened residual of usual size is: 1 where the covariance is known, else a length.
@@ -140,14 +140,14 @@ impl Whitener {
         Self { rows: (0..cells).map(|i| (i, vec![1.0])).collect(), unit_mm: USUAL_UNEVENNESS_MM }
     }
 
-    pub(super) fn of(arcs: &[Arc], cells: &[Cell], covariance: &Covariance) -> Self {
+    pub(super) fn of(stretches: &[Stretch], cells: &[Cell], covariance: &Covariance) -> Self {
         let mut rows: Vec<(usize, Vec<f64>)> = Vec::with_capacity(cells.len());
         for (i, cell) in cells.iter().enumerate() {
             poll();
             let wall = cells[..i].iter().rev().take_while(|c| related(cell, c)).count();
-            let near = |j: &usize| apart_mm(arcs, cell, &cells[*j])[0] < covariance.support_mm[0];
+            let near = |j: &usize| apart_mm(stretches, cell, &cells[*j])[0] < covariance.support_mm[0];
             let first = (i - wall..i).find(near).unwrap_or(i);
-            let mut row: Vec<f64> = (first..i).map(|j| covariance.between(arcs, cell, &cells[j])).collect();
+            let mut row: Vec<f64> = (first..i).map(|j| covariance.between(stretches, cell, &cells[j])).collect();
             for j in first..i {
                 let (start, other) = &rows[j];
                 let from = first.max(*start);

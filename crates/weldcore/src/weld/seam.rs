@@ -1,0 +1,407 @@
+//! The seam's frame: along the seam, across it, and height over the reference wall. What stands behind it (sections, step,
+//! fates, the cloud) knows neither pipes nor degrees.
+//!
+//! A place along a seam is kept as `at`, in the seam's own parameter: the angle of a circle, rad. [`Course`] turns it into mm,
+//! into bins, and into the number that people read. Where [`Course`] is asked, another kind of seam answers for itself; a straight
+//! one, whose parameter is mm and whose radius is infinite, is one more variant here.
+
+use std::f64::consts::TAU;
+
+use crate::error::{Error, Result, require_count, require_positive};
+use crate::ground::threads;
+use crate::ground::transform::Vec3;
+use crate::surfaces::{PointNoise, cylinder};
+
+/// Width of a bin along a closed seam, by contract.
+const BIN_DEG: f64 = 2.0;
+const TURN_DEG: f64 = 360.0;
+const TURN_BINS: usize = 180;
+/// Length of a station along the seam: short enough that a dent of two degrees on a large pipe fills one, long enough
+/// for several points a bin.
+const STATION_MM: f64 = 4.0;
+/// The same on a pipe of less than 50 mm radius, whose arcs are short.
+const SMALL_STATION_MM: f64 = 2.5;
+const SMALL_RADIUS_MM: f64 = 50.0;
+/// How far the real diameter of a pipe may be from its nominal one, relative (the usual delivery tolerance is 1 %). A
+/// radius that the arc does not determine better than this is taken as nominal.
+const DIAMETER_TOLERANCE: f64 = 0.01;
+/// A radius this far from the nominal one, relative, is another pipe's: ovality bends a pipe locally by a few per cent.
+const OTHER_PIPE: f64 = 0.2;
+/// Points that the surface of the reference wall is fitted to.
+const FIT_POINTS: usize = 40_000;
+
+/// How a seam runs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Course {
+    /// Around a pipe: closed. Its parameter is the angle, rad.
+    Circle {
+        /// Of the reference wall's surface.
+        radius_mm: f64,
+    },
+}
+
+impl Course {
+    /// The course of a seam around a pipe of this radius.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for a radius that is none.
+    pub fn of_radius(radius_mm: f64) -> Result<Self> {
+        require_positive("pipe radius", radius_mm)?;
+        Ok(Self::Circle { radius_mm })
+    }
+
+    /// Radius of the reference wall's surface.
+    #[inline]
+    pub fn radius_mm(self) -> f64 {
+        let Self::Circle { radius_mm } = self;
+        radius_mm
+    }
+
+    /// The mean of the courses that several shots have of one seam.
+    pub fn mean(courses: impl ExactSizeIterator<Item = Self>) -> Self {
+        let count = courses.len() as f64;
+        Self::Circle { radius_mm: courses.map(Self::radius_mm).sum::<f64>() / count }
+    }
+
+    /// Length along the seam of a difference of two places.
+    #[inline]
+    pub fn along_mm(self, difference: f64) -> f64 {
+        difference * self.radius_mm()
+    }
+
+    /// The difference of two places that is so long.
+    #[inline]
+    pub fn difference(self, along_mm: f64) -> f64 {
+        along_mm / self.radius_mm()
+    }
+
+    /// From one place to another the short way: `to - from` without whole turns.
+    #[inline]
+    pub fn apart(self, to: f64, from: f64) -> f64 {
+        let turn = to - from;
+        turn - (turn / TAU).round() * TAU
+    }
+
+    /// The middle of places, of whatever precision.
+    pub fn middle<T: nalgebra::RealField + Copy + Into<f64>>(self, places: impl Iterator<Item = T>) -> f64 {
+        let (mut c, mut s) = (0.0, 0.0);
+        for at in places {
+            let (sin, cos) = at.sin_cos();
+            (c, s) = (c + cos.into(), s + sin.into());
+        }
+        f64::atan2(s, c)
+    }
+
+    /// What people read at a place: degrees in [0, 360) from the zero mark of a closed seam.
+    pub fn reading(self, at: f64) -> f64 {
+        self.told(at.to_degrees())
+    }
+
+    /// A reading without whole turns.
+    pub fn told(self, reading: f64) -> f64 {
+        reading.rem_euclid(TURN_DEG)
+    }
+
+    /// The same in the precision of a cloud's points.
+    #[inline]
+    pub fn reading_f32(self, at: f32) -> f32 {
+        let angle = at.to_degrees();
+        if angle < 0.0 { (angle + TURN_DEG as f32).min((TURN_DEG as f32).next_down()) } else { angle }
+    }
+
+    /// The place of a reading.
+    pub fn at_reading(self, reading: f64) -> f64 {
+        reading.to_radians()
+    }
+
+    /// From one reading to another the short way.
+    pub fn readings_apart(self, to: f64, from: f64) -> f64 {
+        self.told(to - from + TURN_DEG / 2.0) - TURN_DEG / 2.0
+    }
+
+    /// The difference of readings that is so long.
+    pub fn reading_of_mm(self, along_mm: f64) -> f64 {
+        self.difference(along_mm).to_degrees()
+    }
+
+    /// The difference of readings after which a closed seam comes back to where it began.
+    pub fn turn(self) -> Option<f64> {
+        Some(TURN_DEG)
+    }
+
+    /// The sign of the unit of readings, as it follows a number.
+    pub fn unit(self) -> &'static str {
+        "°"
+    }
+
+    /// What readings are, as the title of an axis.
+    pub fn label(self) -> &'static str {
+        "angle about the pipe's axis, from the zero mark"
+    }
+
+    /// How many bins the seam has. They are centred on multiples of their width.
+    #[inline]
+    pub fn bins(self) -> usize {
+        TURN_BINS
+    }
+
+    /// Width of a bin, as a reading.
+    pub fn bin_width(self) -> f64 {
+        BIN_DEG
+    }
+
+    /// The bin of a place.
+    #[inline]
+    pub fn bin(self, at: f64) -> usize {
+        ((at.to_degrees() / BIN_DEG).round() as i64).rem_euclid(TURN_BINS as i64) as usize
+    }
+
+    /// The bin so many beyond another; `None` beyond the end of a seam that has ends.
+    pub fn beyond(self, bin: i64, count: i64) -> Option<usize> {
+        Some((bin + count).rem_euclid(TURN_BINS as i64) as usize)
+    }
+
+    /// Which of equal cells along the seam, of about this length, a place lies in: a whole number of them around a closed one.
+    pub fn cell(self, at: f64, cell_mm: f64) -> i64 {
+        let around = (self.along_mm(TAU) / cell_mm).round_ties_even().max(8.0);
+        ((at / TAU).rem_euclid(1.0) * around).floor() as i64
+    }
+
+    /// The middle of a bin, as a reading.
+    pub fn bin_reading(self, bin: usize) -> f64 {
+        BIN_DEG * bin as f64
+    }
+
+    /// The middle of a bin.
+    #[inline]
+    pub fn bin_middle(self, bin: usize) -> f64 {
+        self.at_reading(self.bin_reading(bin))
+    }
+
+    /// Length of a station along the seam.
+    pub fn station_mm(self) -> f64 {
+        if self.radius_mm() < SMALL_RADIUS_MM { SMALL_STATION_MM } else { STATION_MM }
+    }
+
+    /// The length over which a wall of this thickness bends where a ring load draws it in; `None`: this seam is no ring.
+    pub fn shell_mm(self, thickness_mm: f64) -> Option<f64> {
+        Some((self.radius_mm() * thickness_mm).sqrt())
+    }
+
+    /// How the height of a wall at a place grows with its offset, per mm in each of two directions.
+    #[inline]
+    pub(super) fn offset(self, at: f64) -> [f64; 2] {
+        let (sin, cos) = at.sin_cos();
+        [cos, sin]
+    }
+
+    /// How it grows with a difference of the walls' own curvature: of pipes, of their radii.
+    pub(super) fn curvature(self, _at: f64) -> f64 {
+        1.0
+    }
+
+    /// What `offset` and `curvature` span, as columns of size 1 that stay apart on a short stretch, at a distance from its
+    /// middle.
+    pub(super) fn stretch_columns(self, from_middle: f64, half: f64) -> [f64; 3] {
+        [1.0, from_middle.sin() / half.sin().max(1e-9), bow(from_middle, half)]
+    }
+
+    /// How far a wall's height falls short of what is linear in its offset.
+    pub(super) fn second_order(self, offset_mm: [f64; 2], at: f64) -> f64 {
+        let (sin, cos) = at.sin_cos();
+        let across = -offset_mm[0] * sin + offset_mm[1] * cos;
+        across * across / (2.0 * self.radius_mm())
+    }
+}
+
+/// `1 - cos` of the turn, scaled to 1 at the arc's end.
+fn bow(turn: f64, half: f64) -> f64 {
+    ((turn / 2.0).sin() / (half / 2.0).sin().max(1e-9)).powi(2)
+}
+
+/// A seam in space, with the origins of its coordinates.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Seam {
+    /// Where all of them are counted from: of a circle its centre.
+    pub origin_mm: Vec3,
+    /// Unit, from the reference wall to the other wall.
+    pub across: Vec3,
+    /// Unit, at right angles to `across`: from the origin to where `at` is 0. Along runs right-handed about `across`.
+    pub zero: Vec3,
+    /// How it runs.
+    pub course: Course,
+}
+
+impl Seam {
+    /// A seam whose zero direction is the given one made square to `across`.
+    ///
+    /// # Errors
+    /// [`Error::Degenerate`] where the zero mark lies along the axis.
+    pub fn new(origin_mm: Vec3, across: Vec3, zero: Vec3, course: Course) -> Result<Self> {
+        let what = "pipe frame";
+        let across = across
+            .try_normalize(0.0)
+            .ok_or_else(|| Error::Degenerate { what, reason: "the axis has no direction".into() })?;
+        let zero = (zero - across * across.dot(&zero))
+            .try_normalize(1e-6 * zero.norm())
+            .ok_or_else(|| Error::Degenerate { what, reason: "the zero mark lies along the axis".into() })?;
+        Ok(Self { origin_mm, across, zero, course })
+    }
+
+    /// Completes `across` and `zero` to a right-handed frame.
+    pub(super) fn square(&self) -> Vec3 {
+        self.across.cross(&self.zero)
+    }
+
+    /// Away from the metal at a place: the direction of height.
+    pub fn outward(&self, at: f64) -> Vec3 {
+        let (sin, cos) = at.sin_cos();
+        self.zero * cos + self.square() * sin
+    }
+
+    /// The point of the reference wall's surface at a place along and a distance across.
+    pub fn point(&self, at: f64, across_mm: f64) -> Vec3 {
+        self.origin_mm + self.across * across_mm + self.outward(at) * self.course.radius_mm()
+    }
+
+    /// Place along (an angle in [-π, π]), distance across and height (mm) of a point.
+    #[inline]
+    pub fn place(&self, p: &[f64; 3]) -> [f64; 3] {
+        let v = Vec3::from(*p) - self.origin_mm;
+        let (x, y) = (v.dot(&self.zero), v.dot(&self.square()));
+        [y.atan2(x), v.dot(&self.across), x.hypot(y) - self.course.radius_mm()]
+    }
+
+    /// Where a ray from the frame's origin of coordinates first meets the reference wall's surface.
+    pub(super) fn meet(&self, ray: &Vec3) -> Option<Vec3> {
+        let flat = |v: &Vec3| v - self.across * self.across.dot(v);
+        let (d, o) = (flat(ray), flat(&self.origin_mm));
+        let radius = self.course.radius_mm();
+        let (a, b, c) = (d.norm_squared(), d.dot(&o), o.norm_squared() - radius * radius);
+        let root = b * b - a * c;
+        (a > 0.0 && root >= 0.0).then(|| (b - root.sqrt()) / a).filter(|t| *t > 0.0).map(|t| ray * t)
+    }
+
+    /// The seam whose surface fits the reference wall's points best by orthogonal distance, begun at this one, with what they
+    /// allow: a free radius where it is determined to better than a pipe's delivery tolerance, else the nominal one. And
+    /// whether it was free.
+    ///
+    /// # Errors
+    /// [`Error::TooFew`] without points; [`Error::Degenerate`] where they are another part's.
+    pub(super) fn refined(&self, wall: &[[f64; 3]], nominal: Course) -> Result<(Self, bool)> {
+        require_count("points of the reference wall", 100, wall.len())?;
+        let sample: Vec<[f64; 3]> = wall.iter().step_by(wall.len().div_ceil(FIT_POINTS)).copied().collect();
+        let told = nominal.radius_mm();
+        let start =
+            cylinder::Cylinder { point_mm: self.origin_mm, axis: self.across, radius_mm: self.course.radius_mm() };
+        let fixed = cylinder::refine(&sample, start, false, PointNoise::default())?.surface;
+        let free = cylinder::refine(&sample, fixed, true, PointNoise::default()).ok().filter(|fit| {
+            let last = fit.covariance.nrows() - 1;
+            let sigma = fit.covariance[(last, last)].sqrt();
+            // The residuals of a wall are correlated: their number counts for far less than it says, see `step`.
+            let doubt = sigma * (sample.len() as f64 / 100.0).sqrt();
+            doubt < DIAMETER_TOLERANCE * told
+        });
+        if let Some(fit) = &free
+            && (fit.surface.radius_mm / told - 1.0).abs() > OTHER_PIPE
+        {
+            let seen = fit.surface.radius_mm;
+            let reason =
+                format!("the reference wall's radius is {seen:.1} mm, not {told:.1} mm as the part's description says");
+            return Err(Error::Degenerate { what: "pipe", reason });
+        }
+        let (surface, fitted) = free.map_or((fixed, false), |fit| (fit.surface, true));
+        let across = if surface.axis.dot(&self.across) < 0.0 { -surface.axis } else { surface.axis };
+        // The point of the axis next to the origin so far.
+        let origin = surface.point_mm + across * across.dot(&(self.origin_mm - surface.point_mm));
+        Ok((Self::new(origin, across, self.zero, Course::of_radius(surface.radius_mm)?)?, fitted))
+    }
+}
+
+/// A shot's points in a [`Seam`]'s frame, pixel by pixel; NaN where there is no point.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Unrolled {
+    /// Along the seam, in its parameter: an angle in [-π, π].
+    pub at: Vec<f32>,
+    /// Across the seam, mm; the reference wall is negative.
+    pub across_mm: Vec<f32>,
+    /// Over the reference wall's surface, mm.
+    pub height_mm: Vec<f32>,
+}
+
+impl Unrolled {
+    /// Places every point.
+    pub fn of(points: &[[f64; 3]], seam: &Seam) -> Self {
+        let (square, radius) = (seam.square(), seam.course.radius_mm());
+        let parts = threads::map_chunks(points, |_, chunk| {
+            let mut part = Self::default();
+            for p in chunk {
+                let v = Vec3::from(*p) - seam.origin_mm;
+                let (x, y) = (v.dot(&seam.zero), v.dot(&square));
+                part.at.push((y as f32).atan2(x as f32));
+                part.across_mm.push(v.dot(&seam.across) as f32);
+                part.height_mm.push(((x * x + y * y).sqrt() - radius) as f32);
+            }
+            part
+        });
+        let gather = |pick: fn(&Self) -> &Vec<f32>| {
+            let mut all = Vec::with_capacity(points.len());
+            parts.iter().for_each(|p| all.extend_from_slice(pick(p)));
+            all
+        };
+        Self { at: gather(|p| &p.at), across_mm: gather(|p| &p.across_mm), height_mm: gather(|p| &p.height_mm) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn around(radius_mm: f64) -> Course {
+        Course::of_radius(radius_mm).unwrap()
+    }
+
+    #[test]
+    fn a_place_is_where_its_point_is() {
+        let seam =
+            Seam::new(Vec3::new(3.0, -2.0, 400.0), Vec3::new(0.9, 0.1, 0.0), Vec3::new(0.3, 0.0, -1.0), around(54.0))
+                .unwrap();
+        for at in [-3.0, -0.4, 0.0, 1.2, 3.1] {
+            let p = seam.point(at, 7.5) + seam.outward(at) * 0.25;
+            let found = seam.place(&p.into());
+            assert!([at, 7.5, 0.25].iter().zip(found).all(|(a, b)| (a - b).abs() < 1e-12), "{at}: {found:?}");
+            let kept = Unrolled::of(&[p.into()], &seam);
+            assert!((f64::from(kept.at[0]) - at).abs() < 1e-6 && (kept.height_mm[0] - 0.25).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn a_turn_of_a_closed_seam_is_nothing() {
+        let course = around(200.0);
+        assert!((course.apart(3.1, -3.1) - (6.2 - TAU)).abs() < 1e-12);
+        assert!((course.middle([3.0_f32, -3.0].into_iter()).abs() - std::f64::consts::PI).abs() < 1e-6);
+        assert_eq!(course.bin(-0.001), 0);
+        assert_eq!(course.bin(-0.04), course.bins() - 1);
+        assert_eq!(course.beyond(course.bins() as i64 - 1, 2), Some(1));
+        assert!((course.readings_apart(1.0, 359.0) - 2.0).abs() < 1e-12);
+        assert!((0..course.bins()).all(|k| course.bin(course.bin_middle(k)) == k));
+        assert!((course.reading(-0.5) - (360.0 - 0.5_f64.to_degrees())).abs() < 1e-12);
+        assert!(course.reading_f32(-1e-9) < 360.0);
+        assert!((course.along_mm(course.difference(12.5)) - 12.5).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_ray_meets_the_near_side_of_a_cylinder() {
+        let meet = |x: f64| {
+            let seam = Seam::new(Vec3::new(x, 0.0, 100.0), Vec3::y(), Vec3::z(), around(5.0)).unwrap();
+            seam.meet(&Vec3::z())
+        };
+        assert!((meet(3.0).unwrap() - Vec3::new(0.0, 0.0, 96.0)).norm() < 1e-12);
+        assert!(meet(6.0).is_none());
+    }
+
+    #[test]
+    fn a_radius_that_is_none_is_refused() {
+        assert!([-1.0, 0.0, f64::NAN].iter().all(|r| Course::of_radius(*r).is_err()));
+    }
+}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
@@ -21,10 +22,12 @@ from weldscan.result import (
     PartCloud,
     SeamBin,
     StepResult,
+    Verdict,
     bar,
     note,
     warning,
 )
+from weldscan.result.verification import Characteristic, Verification
 
 PART = {
     "kind": "pipe",
@@ -255,3 +258,39 @@ def barred(points: int = 20_000, norms: tuple[str, ...] = ("pnae-g-7-010-89", "i
     )
     coverage = Coverage(100.0, 158.0, "views", ((113.0, 171.0),))
     return replace(with_findings(whole, *findings, coverage=coverage), seam=seam_of(whole, (62.0, 222.0)))
+
+
+def made_up(verdict: Verdict = Verdict.PASS, *, day: int = 0, scanner: str = "s1", value: float = 0.05) -> Verification:
+    """A verification `day` days from now."""
+    date = datetime.now(UTC) + timedelta(days=day)
+    each = Characteristic(
+        name="SD",
+        title="sphere-spacing error",
+        value_mm=value,
+        where="artefact-1, spheres 1-2",
+        mean_mm=value / 2,
+        std_mm=0.01,
+        positions=18,
+        required_positions=7,
+        points=None,
+        limit_mm=0.1,
+        u_mm=0.01,
+        verdict=verdict,
+        reason="",
+    )
+    return Verification(
+        session=f"day {day}",
+        scanner=scanner,
+        date=date.isoformat(timespec="seconds"),
+        date_from="given",
+        valid_until=(date + timedelta(days=365)).isoformat(timespec="seconds"),
+        characteristics=(each,),
+        balls=(),
+        spacings=(),
+        planes=(),
+        lost=(),
+        assumed=(),
+        warnings=(),
+        limits={},
+        software={"version": "0", "session_sha256": f"{day}"},
+    )

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from conftest import shared
-from test_simulate import small_scanner
+from small_cell import small_scanner
 from weldscan import InputError, set_threads
 from weldscan.measure import inspection
 from weldscan.measure.calibration_margin import CalibrationMargin

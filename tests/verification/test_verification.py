@@ -9,7 +9,6 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +17,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from conftest import shared
-from test_simulate import small_scanner
+from small_cell import small_scanner
+from synthetic import made_up
 from weldscan import GeometryError, InputError, Verdict, inspect
 from weldscan._weldcore import sphere_caps
 from weldscan.measure.scanner_standing import scanner_id, standing_of
 from weldscan.records.history import append_history, check_history, read_history
 from weldscan.records.session import read_session
-from weldscan.result import Characteristic, Verification
 from weldscan.simulated import DEFAULT, simulate_session
 from weldscan.verification import (
     VerificationLimits,
@@ -247,42 +246,6 @@ def test_limits_of_a_cell(tmp_path):
 
 
 # --- the history ------------------------------------------------------------------------------------------------------
-
-
-def made_up(verdict: Verdict = Verdict.PASS, *, day: int = 0, scanner: str = "s1", value: float = 0.05) -> Verification:
-    """A verification `day` days from now."""
-    date = datetime.now(UTC) + timedelta(days=day)
-    each = Characteristic(
-        name="SD",
-        title="sphere-spacing error",
-        value_mm=value,
-        where="artefact-1, spheres 1-2",
-        mean_mm=value / 2,
-        std_mm=0.01,
-        positions=18,
-        required_positions=7,
-        points=None,
-        limit_mm=0.1,
-        u_mm=0.01,
-        verdict=verdict,
-        reason="",
-    )
-    return Verification(
-        session=f"day {day}",
-        scanner=scanner,
-        date=date.isoformat(timespec="seconds"),
-        date_from="given",
-        valid_until=(date + timedelta(days=365)).isoformat(timespec="seconds"),
-        characteristics=(each,),
-        balls=(),
-        spacings=(),
-        planes=(),
-        lost=(),
-        assumed=(),
-        warnings=(),
-        limits={},
-        software={"version": "0", "session_sha256": f"{day}"},
-    )
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from test_simulate import small_scanner
+from small_cell import small_scanner
 from weldscan.calibration.artefact import TOUCH_SIGMA_MM, PlateMismatch, PlateView, find_plate
 from weldscan.calibration.hand_eye import (
     POSE_SIGMA_MM,
@@ -163,7 +163,7 @@ def test_95_per_cent_in_the_long_run(soak):
 @pytest.fixture(scope="module")
 def bench():
     """benches/hand_eye.py, which makes the table of docs/hand-eye.md."""
-    path = Path(__file__).resolve().parents[1] / "benches" / "hand_eye.py"
+    path = Path(__file__).resolve().parents[2] / "benches" / "hand_eye.py"
     spec = importlib.util.spec_from_file_location("bench_hand_eye", path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from conftest import shared
-from test_description import CELL, Change, copied, of, pose_of
+from small_cell import CELL, Change, copied, of, pose_of
 from weldscan import SeamCourse
 from weldscan.measure.inspection import inspect
 from weldscan.measure.session_hand_eye import calibrate

@@ -24,7 +24,7 @@ from weldscan.simulated.controllers.kvp import KvpController
 from weldscan.simulated.controllers.rsi import RsiController
 
 POSE = KukaPose(610.825, -148.476, 481.652, -29.008, 23.236, 74.641)
-KRL = Path(__file__).resolve().parents[1] / "krl"
+KRL = Path(__file__).resolve().parents[2] / "krl"
 
 
 # --- KUKAVARPROXY and C3 Bridge ---------------------------------------------------------------------------------------

@@ -19,8 +19,8 @@ import weldscan as ws
 from synthetic import hand_eye
 from weldscan.faces.cli.app import main
 
-DATA = Path(__file__).parent / "data" / "documents-281640f"
-MOVED = Path(__file__).parents[1] / "docs" / "moved.csv"
+DATA = Path(__file__).parents[1] / "data" / "documents-281640f"
+MOVED = Path(__file__).parents[2] / "docs" / "moved.csv"
 BOARD = "chessboard:9x6:10mm"
 MOUNT = "58 -24 112 109 -20 -8"
 LIMITS = "pf_mm = 0.5\nsd_mm = 0.15\n"

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from small_cell import small_scanner
 from weldscan import GeometryError, InputError, Lens, Scanner, SimulatedShot, set_threads, simulate_shot, simulated_step
 from weldscan.pose import matrix_from_kuka
 from weldscan.records.frames import read_frames
@@ -54,15 +55,6 @@ QUIET = Photometry(full_well_e=1e12, read_noise_e=0.0, bits=16, ambient=0.0, bla
 """No noise, no room light: images are the light itself."""
 FULL = 65535.0
 EYE = np.eye(4)
-
-
-def small_scanner(scale: int = 4, axis: str = "x") -> Scanner:
-    """The default scanner with fewer, larger camera pixels."""
-    whole = make_scanner(axis=axis)  # type: ignore[arg-type]
-    k = whole.camera.K / scale
-    k[2, 2] = 1.0
-    camera = Lens(whole.camera.width // scale, whole.camera.height // scale, k, whole.camera.dist)
-    return Scanner(camera, whole.projector, whole.camera_from_projector)
 
 
 SMALL = replace(DEFAULT, scanner=small_scanner())

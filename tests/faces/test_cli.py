@@ -188,7 +188,7 @@ fake.inspect = lambda *_, progress, **__: (progress(1, 2, "measuring"), inspecti
 sys.modules["weldscan.measure.inspection"] = fake
 if "verify" in sys.argv:
     import weldscan.report.verification, weldscan.verification
-    from test_verification import made_up
+    from synthetic import made_up
     weldscan.verification.verify = lambda *_, progress, **__: (progress(1, 2, "measuring"), made_up())[1]
     weldscan.report.verification.write_verification = lambda found, out: (out.mkdir(), (out / "v.json").touch())
 from weldscan.faces.cli.app import main
@@ -197,7 +197,7 @@ main()
 
 
 def script(scale=1.0):
-    return [sys.executable, "-c", SCRIPT.format(tests=str(Path(__file__).parent), scale=scale)]
+    return [sys.executable, "-c", SCRIPT.format(tests=str(Path(__file__).parents[1]), scale=scale)]
 
 
 @pytest.mark.parametrize("code_page", ["utf-8", "cp866", "koi8-r", "ascii"])

@@ -21,8 +21,8 @@ from weldscan.report.charts import Limit, arcs_of, nice_ticks, seam_chart, unsee
 from weldscan.report.pictures import diverging
 from weldscan.result import CODES, FATES, Coverage, Label, Standing, Verdict, bar, note, warning
 
-DATA = Path(__file__).parent / "data"
-FORMATS = Path(__file__).resolve().parents[1] / "docs" / "formats.md"
+DATA = Path(__file__).parents[1] / "data"
+FORMATS = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
 
 
 @pytest.fixture(scope="module")

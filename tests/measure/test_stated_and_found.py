@@ -17,17 +17,15 @@ import cv2
 import numpy as np
 import pytest
 
-from test_simulate import small_scanner
+from small_cell import CELL, Change, copied, of, pose_of
 from weldscan.measure.inspection import inspect
 from weldscan.measure.stated_and_found import held_against_itself
 from weldscan.records.session import Session
 from weldscan.records.shot import faults
 from weldscan.result import Finding, Inspection, Severity, Verdict
-from weldscan.simulated import DEFAULT, pipe, session_document, simulate_session
+from weldscan.simulated import pipe, session_document, simulate_session
 
-CELL = replace(DEFAULT, scanner=small_scanner(2), artefact_shots=2)
 SMALL_PIPE = replace(CELL, weld=pipe(273.0, offset_mm=0.4), thickness_mm=10.0, part_at_deg=(100.0, 160.0))
-Change = Callable[[dict[str, Any]], object]
 
 
 def as_scanned(folder: Path) -> None:
@@ -51,21 +49,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: folder / name for name in ("630", "273")}
 
 
-def copied(folder: Path, target: Path, change: Change = lambda _: None) -> Path:
-    """A copy of a session to spoil, its images linked."""
-    for path in folder.rglob("*.*"):
-        there = target / path.relative_to(folder)
-        there.parent.mkdir(parents=True, exist_ok=True)
-        if path.suffix == ".png":
-            there.symlink_to(path)
-        else:
-            shutil.copyfile(path, there)
-    document = json.loads((target / "session.json").read_text())
-    change(document)
-    (target / "session.json").write_text(json.dumps(document))
-    return target
-
-
 def without_record(folder: Path) -> Path:
     """As a session that no scan wrote."""
     (folder / "plan.json").unlink()
@@ -74,18 +57,9 @@ def without_record(folder: Path) -> Path:
     return folder
 
 
-def pose_of(document: dict[str, Any], name: str) -> dict[str, float]:
-    pose: dict[str, float] = next(shot for shot in document["shots"] if shot["name"] == name)["flange_pose"]
-    return pose
-
-
 def beyond_notes(found: Inspection) -> list[Finding]:
     """What is more than worth knowing: a session without a verification on record has a note."""
     return [finding for finding in found.findings if finding.severity is not Severity.NOTE]
-
-
-def of(found: Inspection, code: str) -> list[Finding]:
-    return [finding for finding in found.findings if finding.code == code]
 
 
 @pytest.mark.parametrize("name", ["630", "273"])

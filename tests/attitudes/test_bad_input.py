@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from test_simulate import small_scanner
+from small_cell import small_scanner
 from weldscan.faces.cli.app import main
 from weldscan.simulated import DEFAULT, simulate_session
 

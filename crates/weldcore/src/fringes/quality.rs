@@ -97,11 +97,13 @@ mod tests {
 
     use super::*;
 
-    /// Four steps after two other frames; the left half as bright as `left`, the right half as `right`; modulated by half.
+    /// Four steps after two other frames; the left half at most as bright as `left`, the right half as `right`, evenly down to
+    /// 60 % of it; modulated by half.
     fn frames(left: f32, right: f32) -> Vec<Vec<u8>> {
         let pixel = |k: usize, step: usize| {
             let phase = TAU * step as f32 / 4.0 + k as f32;
             let bright = if k % 40 < 20 { left } else { right };
+            let bright = bright * (0.6 + 0.02 * (k % 20) as f32);
             (bright * (1.0 + 0.5 * phase.cos())).round().clamp(0.0, 255.0) as u8
         };
         (0..6).map(|f| (0..40 * 30).map(|k| if f < 2 { 10 } else { pixel(k, f - 2) }).collect()).collect()
@@ -116,10 +118,10 @@ mod tests {
     fn the_shares_are_those_of_what_was_shown() {
         let found = judged(&[frames(160.0, 10.0)], 0.1);
         assert_eq!((found.usable, found.saturated, found.dark), (0.5, 0.0, 0.5));
-        // The levels are whole: each modulation is off by half of one at most.
-        assert!((found.median_modulation - 80.0 / 255.0).abs() < 0.5 / 255.0);
+        // Between the two middle pixels of twenty; the levels are whole.
+        assert!((found.median_modulation - 0.79 * 80.0 / 255.0).abs() < 0.5 / 255.0);
         let found = judged(&[frames(250.0, 160.0)], 0.1);
-        assert!(found.saturated > 0.3 && (found.usable + found.saturated - 1.0).abs() < 1e-12);
+        assert!(found.saturated > 0.2 && found.saturated < 0.5 && (found.usable + found.saturated - 1.0).abs() < 1e-12);
     }
 
     #[test]

@@ -70,11 +70,11 @@ fn cap(camera: &Lens, centres: &[Vec3], which: usize, radius: f64) -> SphereCap 
     all
 }
 
-/// Depth at which a unit ray from the origin meets a sphere.
+/// Depth at which a unit ray from the origin enters a sphere before it.
 fn first_hit(ray: &Vec3, centre: &Vec3, radius: f64) -> Option<f64> {
     let along = ray.dot(centre);
     let square = along * along - centre.norm_squared() + radius * radius;
-    (square > 0.0).then(|| along - square.sqrt())
+    (square > 0.0).then(|| along - square.sqrt()).filter(|depth| *depth > 0.0)
 }
 
 #[cfg(test)]

@@ -140,7 +140,7 @@ fn candidate(profile: &Profile, from: usize, to: usize, beside: usize, sigma: f6
 /// The seam's course through the candidates of all stations: their most voted place, then a robust line (the median of all
 /// slopes; Theil 1950, Sen 1968), then per station the candidate next to it.
 #[derive(Debug, Clone)]
-pub(super) struct Course {
+pub(super) struct WeldLine {
     /// Middle of the seam at the place along: `offset + slope · along`.
     pub offset: f64,
     pub slope: f64,
@@ -148,7 +148,7 @@ pub(super) struct Course {
     pub chosen: Vec<Option<Candidate>>,
 }
 
-impl Course {
+impl WeldLine {
     pub fn at(&self, along: f64) -> f64 {
         self.offset + self.slope * along
     }
@@ -162,7 +162,7 @@ impl Course {
 /// Votes fall into cells of this width.
 const VOTE_MM: f64 = 3.0;
 
-pub(super) fn course(found: &[Vec<Candidate>], along: &[f64]) -> Option<Course> {
+pub(super) fn course(found: &[Vec<Candidate>], along: &[f64]) -> Option<WeldLine> {
     let mut votes: std::collections::BTreeMap<i64, f64> = Default::default();
     for one in found.iter().flatten() {
         *votes.entry((one.middle() / VOTE_MM).floor() as i64).or_default() += one.score;
@@ -189,7 +189,7 @@ pub(super) fn course(found: &[Vec<Candidate>], along: &[f64]) -> Option<Course> 
         std::iter::zip(&first, along).filter_map(|(c, &s)| c.map(|c| (s, c.middle()))).collect();
     let (offset, slope) = robust_line(&points);
     let chosen = nearest(&|s| offset + slope * s, (0.3 * width).max(VOTE_MM));
-    Some(Course { offset, slope, chosen })
+    Some(WeldLine { offset, slope, chosen })
 }
 
 /// Theil's and Sen's line: medians of the slopes of all pairs, and of what is left.

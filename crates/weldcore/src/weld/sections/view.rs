@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::cap::{self, Candidate, Course, widest_cap_mm};
+use super::cap::{self, Candidate, WeldLine, widest_cap_mm};
 use super::grid::Grid;
 use super::profile::Profile;
 use super::station::{Kind, Station};
@@ -40,7 +40,7 @@ pub(super) struct View<'a> {
 /// The weld's course.
 pub(super) struct Found {
     pub(super) kind: Kind,
-    pub(super) course: Course,
+    pub(super) course: WeldLine,
     /// All candidates of each station.
     pub(super) candidates: Vec<Vec<Candidate>>,
     /// Part of the stations with a second jump as strong as a weld's; for a flush one.
@@ -80,7 +80,7 @@ impl<'a> View<'a> {
         let along: Vec<f64> = (0..self.grid.stations).map(|k| self.along(k)).collect();
         // Of the stations that hold points at all.
         let filled = self.own.iter().filter(|p| 2.0 * p[1].count(0, p[1].len()) > 0.3 * p[1].len() as f64).count();
-        let part = |course: &Option<Course>| {
+        let part = |course: &Option<WeldLine>| {
             course.as_ref().map_or(0.0, |c| c.chosen.iter().flatten().count() as f64 / filled.max(1) as f64)
         };
         let raised = self.candidates(1.0);

@@ -345,12 +345,25 @@ fn seam_fates<'py>(
     Ok((table(found.all)?, table(found.near)?))
 }
 
+/// Looks at the reference wall of a segmented shot: how far it tells the direction and place of a cylinder fitted to it.
+///
+/// Returns (angle in the middle of its arc (rad), half the arc (rad), standard deviation of along * sin(angle) (mm), rms of the
+/// unevenness that is neither the same all along nor all around (mm)), or None where there is no wall. Source:
+/// `crates/weldcore/src/weld/agreement.rs`.
+#[pyfunction]
+fn wall_seen(py: Python<'_>, shot: PyRef<'_, WeldShot>) -> PyResult<Option<(f64, f64, f64, f64)>> {
+    let shot = &shot.0;
+    let found = compute(py, || Ok(crate::weld::agreement::wall_seen(shot)))?;
+    Ok(found.map(|w| (w.middle_rad, w.half_arc_rad, w.twist_mm, w.waves_mm)))
+}
+
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     agreement::register(m)?;
     paper::register(m)?;
     whitening::register(m)?;
     m.add_function(wrap_pyfunction!(seam_fates, m)?)?;
     m.add_class::<WeldShot>()?;
+    m.add_function(wrap_pyfunction!(wall_seen, m)?)?;
     m.add_function(wrap_pyfunction!(segment_weld, m)?)?;
     m.add_function(wrap_pyfunction!(measure_step, m)?)?;
     m.add_function(wrap_pyfunction!(place_shots, m)?)

@@ -3,7 +3,6 @@
 use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::prelude::*;
 
-use super::WeldShot;
 use crate::error::Error;
 use crate::ground::transform::Vec3;
 use crate::python::call::{compute, raise};
@@ -46,19 +45,6 @@ fn wall_differences<'py>(
     Ok(found.into_iter().map(pair).collect())
 }
 
-/// Looks at the reference wall of a segmented shot: how far it tells the direction and place of a cylinder fitted to it.
-///
-/// Returns (angle in the middle of its arc (rad), half the arc (rad), standard deviation of along * sin(angle) (mm), rms of the
-/// unevenness that is neither the same all along nor all around (mm)), or None where there is no wall. Source:
-/// `crates/weldcore/src/weld/agreement.rs`.
-#[pyfunction]
-fn wall_seen(py: Python<'_>, shot: PyRef<'_, WeldShot>) -> PyResult<Option<(f64, f64, f64, f64)>> {
-    let shot = &shot.0;
-    let found = compute(py, || Ok(agreement::wall_seen(shot)))?;
-    Ok(found.map(|w| (w.middle_rad, w.half_arc_rad, w.twist_mm, w.waves_mm)))
-}
-
 pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_function(wrap_pyfunction!(wall_differences, m)?)?;
-    m.add_function(wrap_pyfunction!(wall_seen, m)?)
+    m.add_function(wrap_pyfunction!(wall_differences, m)?)
 }

@@ -9,7 +9,7 @@ use crate::python::convert::{float_matrix, points, vector};
 use crate::weld::paper::{self, Pipe};
 
 /// Edges, counts, which bins count, and their mean.
-type Found<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<bool>>, f64);
+type HistogramArrays<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<bool>>, f64);
 
 /// Measures the misalignment of two walls as the paper does.
 ///
@@ -25,7 +25,7 @@ fn misalignment<'py>(
     axis_point_mm: &Bound<'py, PyAny>,
     axis: &Bound<'py, PyAny>,
     radius_mm: f64,
-) -> PyResult<Found<'py>> {
+) -> PyResult<HistogramArrays<'py>> {
     let given = float_matrix("points_mm", points_mm)?;
     let points = points("points_mm", &given)?;
     let origin_mm = Vec3::from(vector("axis_point_mm", axis_point_mm)?);

@@ -2,8 +2,6 @@
 
 from weldscan._later import later
 from weldscan._weldcore import (
-    SeamCourse,
-    SeamFrame,
     WeldShot,
     measure_step,
     place_shots,
@@ -35,8 +33,6 @@ __getattr__ = later(
 )
 
 __all__ = [
-    "SeamCourse",
-    "SeamFrame",
     "WeldShot",
     "inspect",
     "judge",

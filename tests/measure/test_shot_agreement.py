@@ -13,7 +13,7 @@ import pytest
 
 from conftest import shared
 from small_cell import CELL, Change, copied, of, pose_of
-from weldscan import SeamCourse
+from weldscan._weldcore import SeamCourse
 from weldscan.measure.inspection import inspect
 from weldscan.measure.session_hand_eye import calibrate
 from weldscan.measure.shot_agreement import _unlike, copies

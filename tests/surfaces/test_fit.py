@@ -217,14 +217,12 @@ def test_the_covariance_is_that_of_many_repetitions() -> None:
     for name, fit, clean, truth in surfaces(np.random.default_rng(5), noise):
         rng = np.random.default_rng(7)
         misses, sizes, given_sizes = [], [], []
-        for k in range(repetitions):
+        for _ in range(repetitions):
             points = clean + rng.normal(0, noise, clean.shape)
             found = fit(points)
             misses.append(parameters(found)[: len(truth)] - truth)
             sizes.append(np.diag(found.covariance))
-            # What is given does not scatter: a few show it.
-            if k < 30:
-                given_sizes.append(np.diag(fit(points, sigma_mm=noise).covariance))
+            given_sizes.append(np.diag(fit(points, sigma_mm=noise).covariance))
         spread = np.sqrt(np.mean(np.square(misses), axis=0))
         stated = np.sqrt(np.mean(sizes, axis=0))
         use = np.isfinite(truth) & (stated > 1e-9)

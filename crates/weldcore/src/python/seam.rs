@@ -25,7 +25,7 @@ type Numbers<'py> = Bound<'py, PyArray1<f64>>;
 ///     InputError: a radius that is none.
 ///
 /// Example:
-///     >>> from weldscan import SeamCourse
+///     >>> from weldscan._weldcore import SeamCourse
 ///     >>> course = SeamCourse(200.0)
 ///     >>> course.bins, course.bin_width, course.unit
 ///     (180, 2.0, '°')
@@ -140,7 +140,7 @@ impl PyCourse {
 ///     GeometryError: `across` has no direction, or `zero` lies along it.
 ///
 /// Example:
-///     >>> from weldscan import SeamCourse, SeamFrame
+///     >>> from weldscan._weldcore import SeamCourse, SeamFrame
 ///     >>> seam = SeamFrame([0, 0, 0], [1, 0, 0], [0, 0, 1], SeamCourse(100.0))
 ///     >>> at, across_mm, height_mm = seam.place([[5.0, 0.0, 101.0]])
 ///     >>> at[0], across_mm[0], height_mm[0]

@@ -23,6 +23,8 @@ __all__ = [
     "Registration",
     "RigidFit",
     "Scanner",
+    "SeamCourse",
+    "SeamFrame",
     "SimulatedShot",
     "Sphere",
     "SphereFit",

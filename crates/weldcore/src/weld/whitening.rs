@@ -1,6 +1,6 @@
 //! Columns of a linear model over points of one wall, divided by the root of the wall's covariance.
 //!
-//! The covariance is that of the walls' unevenness, as the step's fit has it: [`wendland`] of the distance over the supports
+//! The covariance is that of the walls' unevenness, as the step's fit has it: `wendland` of the distance over the supports
 //! around and along the wall, and a nugget of what neighbours do not share; here in units of the unevenness' variance.
 //! Least squares of the whitened columns are generalised least squares of the plain ones.
 //!

@@ -20,9 +20,10 @@ const FLUSH_GAPS: [f64; 2] = [0.2, 0.4];
 /// Toes wander by less than this between neighbours, and as a part of the width.
 const WANDER_MM: f64 = 0.6;
 const WANDER_WIDTHS: f64 = 0.06;
-/// A toe that is hidden, a cap's flank of this length inside it and the first of the wall outside, over more than a pixel.
+/// A toe that is hidden, a cap's flank of this length inside it and the first of the wall outside, over more than the flank
+/// takes for itself: what is left of a cap 0.9 mm high runs out over so much at a toe angle of 150 degrees.
 const HIDDEN_ABOUT_MM: [f64; 2] = [3.0, 1.5];
-const HIDDEN_MM: f64 = 0.8;
+const HIDDEN_MM: f64 = 1.5;
 /// Thicker walls are bevelled down to thinner ones by 15 degrees at most (PNAE G-7-009, GOST 16037: 12 to 15).
 const STEEPEST_BEVEL: f64 = 0.27;
 /// What is the wall's own is there in so many neighbours on either side too.

@@ -78,6 +78,12 @@ def inspected(kind, seed, tmp_path, change=lambda clouds: None, **asked):
     return scene, inspect(tmp_path, reader=reader, **asked)
 
 
+# Scenes that once passed: a bevel in the strip beside the toe, a V across a flush weld, two thin pipes.
+@pytest.mark.parametrize(("kind", "seed"), [("taper 1:4", 621), ("flush taper", 703), ("two pipes", 816)])
+def test_what_once_passed_wrongly_does_not(kind, seed, tmp_path):
+    assert inspected(kind, seed, tmp_path)[1].verdict is not Verdict.PASS
+
+
 # Seeds with a small view, so that the test stays short; the campaign with all kinds is benches/trust.py.
 @pytest.mark.parametrize(
     "kind", ["taper 1:4", "counterbore", "flare", "dent", "bulge", "two seams", "coat", "tape", "dark arc"]

@@ -294,7 +294,7 @@ class _Run:
         placed = [PlacedShot(shot.name, index, base_from_flange(shot)) for index, shot in shots]
         pairs = agreement(cloud, placed, hand_eye, views[0].seam_in_base)
         said = [said for pair in pairs if (said := complaint(pair)) is not None]
-        return pairs, (*said, *shots_agree(views, hand_eye))
+        return pairs, (*said, *shots_agree(views, hand_eye, self.part.wall_thickness))
 
     def paper(self, cloud: PartCloud, view: PartView) -> tuple[Histogram | None, tuple[Finding, ...]]:
         """The paper's chain; None with a note where it finds no answer."""

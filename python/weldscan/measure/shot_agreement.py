@@ -59,6 +59,8 @@ SIGMAS = 3.0
 # What two places of the scanner's field read differently: calibrations of one scanner differ by 0.15 mm (rms) in the
 # step. A real disagreement of two pipes, or of a wall misread, matters from there on.
 STEP_SLACK_MM = 0.2
+# But no more than half of what PNAE G-7-010 allows a thin wall, 0.2 t.
+SLACK_THICKNESSES = 0.1
 # Below that, from here on, it is worth a warning: waves of the walls.
 STEP_WARNING_MM = 0.1
 # A bin may be so many bins off: an oval pipe moves the centre about which a shot counts its places.
@@ -157,12 +159,13 @@ def copies(digests: Mapping[str, str]) -> list[Finding]:
 # --- the pipe and the step, shot by shot ------------------------------------------------------------------------------
 
 
-def shots_agree(views: Sequence[PartView], hand_eye: HandEye) -> list[Finding]:
+def shots_agree(views: Sequence[PartView], hand_eye: HandEye, thickness_mm: float = math.inf) -> list[Finding]:
     """Whether the shots are of one pipe that stood still.
 
     Args:
         views: the segmented part shots.
         hand_eye: through which they were placed.
+        thickness_mm: of the wall: what two shots may read differently is little beside what it is allowed.
 
     Returns:
         Bars `shots-disagree`, each naming two shots (or the one that contradicts all others) with their numbers;
@@ -174,7 +177,7 @@ def shots_agree(views: Sequence[PartView], hand_eye: HandEye) -> list[Finding]:
         for i, j in combinations(range(len(seen)), 2)
         if (complaints := list(_misplaced(seen[i], seen[j], hand_eye)))
     }
-    return [*_about_places(views, misplaced), *_stepped_alike(views, hand_eye, set(misplaced))]
+    return [*_about_places(views, misplaced), *_stepped_alike(views, hand_eye, set(misplaced), thickness_mm)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,7 +287,9 @@ def _turning_rad(hand_eye: HandEye) -> float:
     return math.sqrt(2 * pose_sigma(hand_eye)[1] ** 2 + 4 * max(common, 0.0))
 
 
-def _stepped_alike(views: Sequence[PartView], hand_eye: HandEye, not_these: set[tuple[int, int]]) -> list[Finding]:
+def _stepped_alike(
+    views: Sequence[PartView], hand_eye: HandEye, not_these: set[tuple[int, int]], thickness_mm: float
+) -> list[Finding]:
     """The step of each shot alone, bin by bin, where two of them saw the seam; but for pairs whose places are wrong."""
     seen = [_bins_seen(view) for view in views]
     pairs = [
@@ -308,7 +313,7 @@ def _stepped_alike(views: Sequence[PartView], hand_eye: HandEye, not_these: set[
     for i, j in pairs:
         if i in alone and j in alone:
             bounds, course = _of_edges(views[i], views[j]), views[i].shot.seam.course
-            found += list(_unlike(views[i].name, views[j].name, course, alone[i], alone[j], *bounds))
+            found += list(_unlike(views[i].name, views[j].name, course, alone[i], alone[j], *bounds, thickness_mm))
     return sorted(found, key=lambda finding: finding.severity is not Severity.BAR)[:MOST_SAID]
 
 
@@ -331,6 +336,7 @@ def _unlike(
     b: Mapping[int, tuple[float, float]],
     apart_mm: Floats | None = None,
     open_mm: Floats | None = None,
+    thickness_mm: float = math.inf,
 ) -> Iterator[Finding]:
     """Where two profiles of the walls differ by more than their uncertainty in bins beside each other.
 
@@ -339,6 +345,7 @@ def _unlike(
     """
     unread: Floats = np.full(course.bins, np.nan)
     apart_mm, open_mm = unread if apart_mm is None else apart_mm, unread if open_mm is None else open_mm
+    slack_mm = min(STEP_SLACK_MM, SLACK_THICKNESSES * thickness_mm)
     excess = {}
     for k, (step, sigma) in a.items():
         shifted = (course.beyond(k, shift) for shift in range(-STEP_SHIFT_BINS, STEP_SHIFT_BINS + 1))
@@ -348,8 +355,8 @@ def _unlike(
             off = max(0.0, low - step, step - high)
             beyond_mm = off - SIGMAS * math.hypot(sigma, b[k][1])
             alike = apart_mm[k] <= open_mm[k] + STEP_WARNING_MM and apart_mm[k] + open_mm[k] < beyond_mm
-            excess[k] = min(beyond_mm, STEP_SLACK_MM) if alike else beyond_mm
-    for slack, severe in ((STEP_SLACK_MM, True), (STEP_WARNING_MM, False)):
+            excess[k] = min(beyond_mm, slack_mm) if alike else beyond_mm
+    for slack, severe in ((slack_mm, True), (min(STEP_WARNING_MM, slack_mm), False)):
         beyond = {k for k, off in excess.items() if off > slack}
         lasting = [k for k in sorted(beyond) if course.beyond(k, 1) in beyond or course.beyond(k, -1) in beyond]
         worst = max(lasting, default=None, key=lambda k: excess[k])

@@ -28,6 +28,8 @@ INSTANT = {
     "Plane": "keeps numbers",
     "Scanner": "keeps numbers",
     "Sphere": "keeps numbers",
+    "WeldStep.column": "one of nine numbers of each bin",
+    "WeldStep.keys": "19 names",
     "harmonics_of_gamma": "47 products",
     "phase_error_of_harmonics": "512 points of a curve",
     "set_threads": "sets a number",

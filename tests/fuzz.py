@@ -250,6 +250,11 @@ def weld_shot() -> ws.WeldShot:
     return ws.segment_weld(weld_points(), 315.0, 6.0)
 
 
+@cache
+def weld_step() -> ws.WeldStep:
+    return ws.measure_step([weld_shot()])
+
+
 def segmentation(rng: Random) -> Arguments:
     cloud = weld_points().copy()
     cloud[rng.random(cloud.shape[:2]) < rng.random() * 0.5] = np.nan
@@ -290,6 +295,8 @@ SANE: dict[str, Callable[[Random], Arguments]] = {
     "Scanner.project_to_projector": lambda r: {"self": scanner(r), "points": points(r)},
     "SimulatedShot.capture": lambda r: {"self": shot(), "picture": r.integers(0, 256, (12, 16), np.uint8)},
     "Sphere": lambda r: {"center_mm": r.normal(size=3), "radius_mm": r.random() * 50},
+    "WeldStep.column": lambda r: {"self": weld_step(), "name": ["step_mm", "angle_deg"][r.integers(2)]},
+    "WeldStep.keys": lambda r: {"self": weld_step()},
     "calibrate_reference_plane": reference,
     "decode": decoding,
     "decode_gray": gray,

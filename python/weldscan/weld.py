@@ -3,6 +3,7 @@
 from weldscan._later import later
 from weldscan._weldcore import (
     WeldShot,
+    WeldStep,
     measure_step,
     place_shots,
     seam_fates,
@@ -34,6 +35,7 @@ __getattr__ = later(
 
 __all__ = [
     "WeldShot",
+    "WeldStep",
     "inspect",
     "judge",
     "limit_mm",

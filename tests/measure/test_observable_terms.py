@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 
@@ -18,7 +19,7 @@ STEP = {
 
 
 def test_what_is_determined_has_its_uncertainty():
-    found = seam_terms(STEP, 630.0, 6.0)
+    found = seam_terms(SimpleNamespace(**STEP), 630.0, 6.0)
     assert found.not_observable == ()
     assert found.harmonics_mm == pytest.approx(
         {
@@ -34,9 +35,9 @@ def test_what_is_determined_has_its_uncertainty():
 
 def test_what_once_stood_under_a_green_pass_is_not_observable():
     # -58.8 +- 136.8 mm of diameter and 29.7 mm of offset, of a short arc.
-    found = seam_terms(
-        {"radius_difference_mm": (-29.4, 34.2), "axis_offset_mm": [29.7, 0.0], "tilt_rad": 0.0}, 630.0, 6.0
-    )
+    arc = {"radius_difference_mm": (-29.4, 34.2), "axis_offset_mm": [29.7, 0.0], "tilt_rad": 0.0}
+    unstated = {"axis_offset_standard_mm": math.nan, "tilt_standard_rad": math.inf}
+    found = seam_terms(SimpleNamespace(**arc, **unstated), 630.0, 6.0)
     assert found.harmonics_mm == {} and found.angle_deg is found.angle_u_deg is None
     assert found.not_observable == ("diameter_difference", "axis_offset", "angle_between_walls")
 
@@ -53,7 +54,7 @@ def test_what_once_stood_under_a_green_pass_is_not_observable():
 def test_half_of_what_pipes_differ_by_is_the_bound(field, name, at_most):
     def missing(standard: float | None) -> tuple[str, ...]:
         value = (0.2, standard) if field == "radius_difference_mm" else standard
-        return seam_terms({**STEP, field: value}, 630.0, 6.0).not_observable
+        return seam_terms(SimpleNamespace(**{**STEP, field: value}), 630.0, 6.0).not_observable
 
     assert missing(0.0) == missing(0.999 * at_most) == ()
     assert missing(1.001 * at_most) == missing(math.inf) == missing(math.nan) == (name,)

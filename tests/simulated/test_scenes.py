@@ -192,7 +192,7 @@ def test_a_flat_calm_weld_is_measured_right(plain):
         axis, zero = (turn @ base[:3, 2]).tolist(), (turn @ base[:3, 0]).tolist()
         shots.append(segment_weld(shot.points_mm, weld.radius_mm, weld.thickness_mm, axis, zero))
     step = measure_step(shots)
-    assert abs(step["max_abs_mm"] - truth(scene)["largest"]) < 0.01
+    assert abs(step.max_abs_mm - truth(scene)["largest"]) < 0.01
 
 
 def test_the_same_bits_on_one_and_two_threads():

@@ -17,7 +17,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import WeldShot, __version__, measure_step, place_shots, segment_weld
+from weldscan._weldcore import WeldShot, WeldStep, __version__, measure_step, place_shots, segment_weld
 from weldscan.calibration.hand_eye import point_uncertainty_mm, pose_sigma
 from weldscan.errors import GeometryError, InputError
 from weldscan.measure.calibration_margin import CalibrationMargin, Unevenness, calibration_above, calibration_margin
@@ -255,11 +255,11 @@ class _Run:
             views,
             found.angle_deg,
             self.part.wall_thickness,
-            Unevenness(step["residual_rms_mm"], *step["correlation_mm"]),
+            Unevenness(step.residual_rms_mm, *step.correlation_mm),
             self.read.axis,
         )
         noticed, t = noticed + Journal(seam.findings) + took("seam", t), time.perf_counter()
-        deviations = step["deviation_mm"]
+        deviations = step.deviation_mm
         cloud = PartCloud(
             *place_shots(
                 [(v.shot, v.points_mm, v.base_from_scanner, d, v.index) for v, d in zip(views, deviations, strict=True)]
@@ -523,23 +523,21 @@ BUDGET = (
 )
 
 
-def _step_result(step: dict[str, Any], edges: EdgeProfile, part: PartSpec) -> StepResult:
+def _step_result(step: WeldStep, edges: EdgeProfile, part: PartSpec) -> StepResult:
     """The profile of the bins in which both walls and both edges were read; judged by the larger upper bound."""
-    columns = step["profile_columns"]
-    table = step["profile"]
+    bins = np.rint(step.column("angle_deg") / edges.course.bin_width).astype(int)
+    read = np.isfinite(edges.step_mm[bins])
 
     def column(name: str) -> Floats:
-        return np.asarray(table[:, columns.index(name)])
+        return step.column(name)[read]
 
-    bins = np.rint(column("angle_deg") / edges.course.bin_width).astype(int)
-    read = np.isfinite(edges.step_mm[bins])
-    table, bins = table[read], bins[read]
+    bins = bins[read]
     wall, wall_u = column("step_mm"), 2 * column("standard_mm")
     edge, edge_u = edges.step_mm[bins], edges.u_mm[bins]
     budget: tuple[BudgetLine, ...] = ()
     value, u, at = math.nan, math.nan, math.nan
     judged: Literal["wall", "edge"] = "wall"
-    if len(table):
+    if len(bins):
         worst = int(np.argmax(np.abs(wall)))
         value, u, at = abs(float(wall[worst])), float(wall_u[worst]), float(column("angle_deg")[worst])
         budget = tuple(BudgetLine(name, float(column(key)[worst]), derived) for key, name, derived in BUDGET)
@@ -556,8 +554,8 @@ def _step_result(step: dict[str, Any], edges: EdgeProfile, part: PartSpec) -> St
             budget = (BudgetLine("edges", u / 2, derived),)
     terms = seam_terms(step, part.outside_diameter, part.wall_thickness)
     return StepResult(
-        mean_mm=step["mean_mm"],
-        median_mm=step["median_mm"],
+        mean_mm=step.mean_mm,
+        median_mm=step.median_mm,
         max_abs_mm=value,
         max_abs_at_deg=at,
         expanded_uncertainty_mm=u,
@@ -570,7 +568,7 @@ def _step_result(step: dict[str, Any], edges: EdgeProfile, part: PartSpec) -> St
         angle_between_walls_deg=terms.angle_deg,
         angle_between_walls_u_deg=terms.angle_u_deg,
         not_observable=terms.not_observable,
-        coverage_deg=edges.course.bin_width * len(table),
+        coverage_deg=edges.course.bin_width * len(bins),
         judged=judged,
         edge_upper_mm=None if edges.judged is None else sum(edges.judged),
         wall_step_mm=wall,

@@ -8,9 +8,8 @@ off. A number is shown only with its uncertainty, and only where that is at most
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 # Standard deviations of what pipes are, before any scan.
 DIAMETER_PRIOR = 0.01
@@ -19,6 +18,21 @@ OFFSET_PRIOR = 1.0
 """Of the axes' offset, in wall thicknesses: beyond it the walls no longer meet."""
 ANGLE_PRIOR_DEG = math.degrees(1.5 / 200)
 """Of the angle between the axes: 1.5 mm over 200 mm of pipe, what a fitted joint may be bent by."""
+
+
+class FittedTerms(Protocol):
+    """What the fit of a step says of the two pipes (`WeldStep`); standard uncertainties (k = 1)."""
+
+    @property
+    def radius_difference_mm(self) -> tuple[float, float]: ...
+    @property
+    def axis_offset_mm(self) -> list[float]: ...
+    @property
+    def axis_offset_standard_mm(self) -> float: ...
+    @property
+    def tilt_rad(self) -> float: ...
+    @property
+    def tilt_standard_rad(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -32,24 +46,27 @@ class SeamTerms:
     not_observable: tuple[str, ...]
 
 
-def seam_terms(step: Mapping[str, Any], outside_diameter_mm: float, wall_mm: float) -> SeamTerms:
+def seam_terms(step: FittedTerms, outside_diameter_mm: float, wall_mm: float) -> SeamTerms:
     """Diameter difference, axis offset and angle between the walls, each with its U or not at all.
 
     Args:
-        step: what `measure_step` returned: `radius_difference_mm` (value, standard uncertainty), `axis_offset_mm`,
-            `tilt_rad` and, where the core states them, `axis_offset_standard_mm` and `tilt_standard_rad`, the standard
-            uncertainties of offset and tilt along their own direction.
+        step: what `measure_step` returned: radius difference with its standard uncertainty, axis offset and angle, with
+            theirs along their own direction; infinite or NaN where it has none.
         outside_diameter_mm: rated.
         wall_mm: rated thickness of the wall.
 
     Example:
+        >>> from types import SimpleNamespace
         >>> from weldscan.measure.observable_terms import seam_terms
-        >>> step = {"radius_difference_mm": (-29.4, 34.2), "axis_offset_mm": (29.0, 6.0), "tilt_rad": 0.001}
+        >>> step = SimpleNamespace(
+        ...     radius_difference_mm=(-29.4, 34.2), axis_offset_mm=[29.0, 6.0], axis_offset_standard_mm=14.0,
+        ...     tilt_rad=0.001, tilt_standard_rad=0.02,
+        ... )
         >>> seam_terms(step, 630.0, 6.0).not_observable
         ('diameter_difference', 'axis_offset', 'angle_between_walls')
     """
-    half, half_standard = step["radius_difference_mm"]
-    east, north = step["axis_offset_mm"]
+    half, half_standard = step.radius_difference_mm
+    east, north = step.axis_offset_mm
     harmonics: dict[str, float] = {}
     missing = []
     u = _expanded(2 * half_standard)
@@ -57,21 +74,21 @@ def seam_terms(step: Mapping[str, Any], outside_diameter_mm: float, wall_mm: flo
         harmonics |= {"diameter_difference": 2 * half, "diameter_difference_u": u}
     else:
         missing.append("diameter_difference")
-    u = _expanded(step.get("axis_offset_standard_mm"))
+    u = _expanded(step.axis_offset_standard_mm)
     if _determined(u, OFFSET_PRIOR * wall_mm):
         at = math.degrees(math.atan2(north, east)) % 360
         harmonics |= {"axis_offset": math.hypot(east, north), "axis_offset_u": u, "axis_offset_at_deg": at}
     else:
         missing.append("axis_offset")
-    u = math.degrees(_expanded(step.get("tilt_standard_rad")))
+    u = math.degrees(_expanded(step.tilt_standard_rad))
     if _determined(u, ANGLE_PRIOR_DEG):
-        return SeamTerms(harmonics, math.degrees(step["tilt_rad"]), u, tuple(missing))
+        return SeamTerms(harmonics, math.degrees(step.tilt_rad), u, tuple(missing))
     return SeamTerms(harmonics, None, None, (*missing, "angle_between_walls"))
 
 
-def _expanded(standard: float | None) -> float:
-    """With k = 2; infinite where it is not stated."""
-    return math.inf if standard is None or not math.isfinite(standard) else 2 * float(standard)
+def _expanded(standard: float) -> float:
+    """With k = 2; infinite where there is none."""
+    return 2 * float(standard) if math.isfinite(standard) else math.inf
 
 
 def _determined(expanded: float, prior: float) -> bool:

@@ -303,12 +303,9 @@ def _stepped_alike(
             step = measure_step([views[k].shot], angle_sigma_rad=_turning_rad(hand_eye))
         except GeometryError:
             continue
-        columns = step["profile_columns"]
-        angle, value, sigma = (columns.index(name) for name in ("angle_deg", "step_mm", "standard_mm"))
-        course = views[k].shot.seam.course
-        alone[k] = {
-            round(row[angle] / course.bin_width): (float(row[value]), float(row[sigma])) for row in step["profile"]
-        }
+        bins = np.rint(step.column("angle_deg") / views[k].shot.seam.course.bin_width).astype(int).tolist()
+        told = zip(step.column("step_mm").tolist(), step.column("standard_mm").tolist(), strict=True)
+        alone[k] = dict(zip(bins, told, strict=True))
     found = []
     for i, j in pairs:
         if i in alone and j in alone:

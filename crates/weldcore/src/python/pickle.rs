@@ -31,12 +31,14 @@ use crate::python::surfaces::find_spheres::PyFoundSphere;
 use crate::python::surfaces::fit::{Common, CylinderFit, PlaneFit, SphereFit};
 use crate::python::surfaces::shapes::{PyCylinder, PyPlane, PySphere};
 use crate::python::weld::WeldShot;
+use crate::python::weld::step::WeldStep;
 use crate::scanner::{Lens, Rays, Scanner};
 use crate::simulate::{Frames, Photometry, Sample, SimulatedShot};
 use crate::surfaces::find_spheres::FoundSphere;
 use crate::surfaces::{Cylinder, Plane, Sphere};
 use crate::weld::sections::{Doubt, Edge, Grid, Kind, Sections, Station, WallRun};
 use crate::weld::segment::Segmentation;
+use crate::weld::step::{ProfileBin, Step};
 use crate::weld::{Course, Seam, Unrolled};
 
 const VERSION: &str = env!("CARGO_PKG_VERSION");
@@ -204,6 +206,14 @@ structs! {
     Segmentation {
         seam, labels, unrolled, noise_mm, bead_width_mm, course_fitted, fates, thickness_mm, sections,
     }
+    ProfileBin {
+        along, seen_along, step_mm, standard_mm, fit_mm, toe_mm, local_mm, place_mm, unevenness_mm,
+    }
+    Step {
+        mean_mm, median_mm, max_abs_mm, max_abs_at, expanded_mm, profile, coverage, curvature_mm, offset_mm,
+        offset_standard_mm, tilt_rad, tilt_standard_rad, shape_degree, shrinkage_mm, residual_rms_mm, correlation_mm,
+        effective_cells, deviation_mm,
+    }
     Sample { depth_mm, column_px, row_px, deviation_mm, along, direct, ambient, label }
     Photometry { lamp, distance_mm, ambient, black, gamma, blur_px, full_well_e, read_noise_e, bits, seed }
 }
@@ -253,6 +263,7 @@ by_bytes! {
     PyCourse: o => o.0, it => Self(it);
     PySeam: o => o.0, it => Self(it);
     WeldShot: o => o.0, it => Self(it);
+    WeldStep: o => o.0, it => Self(it);
     PlaneFit: o => *o, it => it;
     SphereFit: o => *o, it => it;
     CylinderFit: o => *o, it => it;
@@ -395,7 +406,7 @@ macro_rules! classes {
 classes! {
     PyLens, PyScanner, PyPhaseMap, PyDisagreement, PyWrappedPhase, PyPhaseError, PyCloud, PyReferencePlane, PyKdTree,
     PyFollower, PyPlane, PySphere, PyCylinder, PyMesh, PlaneFit, SphereFit, CylinderFit, PyFoundSphere, PyWeak,
-    PyRegistration, PyRigidFit, PyCourse, PySeam, WeldShot, PyShot, PyWeldSurface,
+    PyRegistration, PyRigidFit, PyCourse, PySeam, WeldShot, WeldStep, PyShot, PyWeldSurface,
 }
 
 /// What `_put_together` is called with.

@@ -2,6 +2,7 @@
 
 mod agreement;
 mod paper;
+pub(crate) mod step;
 mod whitening;
 
 use numpy::{
@@ -20,7 +21,6 @@ use crate::python::seam::PySeam;
 use crate::weld::place::{self, Scan};
 use crate::weld::sections::Station;
 use crate::weld::segment::{self, Segmentation};
-use crate::weld::step::{self, Known, LabelledShot};
 use crate::weld::{Course, Nominal};
 
 /// One part shot, cut into reference wall, other wall and bead (see `segment_weld`).
@@ -189,70 +189,6 @@ fn segment_weld(
     segmented.map(WeldShot)
 }
 
-/// The columns of the profile that `measure_step` returns.
-const PROFILE_COLUMNS: [&str; 9] =
-    ["angle_deg", "seen_at_deg", "step_mm", "standard_mm", "fit_mm", "toe_mm", "local_mm", "angle_mm", "unevenness_mm"];
-
-/// Measures the step of the other wall over the reference wall on all shots together.
-///
-/// shots: a list of WeldShot. angle_sigma_rad: standard uncertainty of the angle about the axis (k = 1). Returns a dict: `mean_mm, median_mm` over the other wall's points, `max_abs_mm, max_abs_at_deg, expanded_mm`
-/// (k = 2) over the profile, `profile` (n, 9) float64 with the columns `profile_columns`: angle_deg, seen_at_deg,
-/// step_mm, standard_mm and its parts (k = 1); `coverage_deg`, `deviation_mm` (a (H * W,) float32 array per shot, from the
-/// corrected reference wall), and the model's parameters. Raises GeometryError where the walls do not determine it.
-/// Source: `crates/weldcore/src/step.rs`.
-#[pyfunction]
-#[pyo3(signature = (shots, angle_sigma_rad=0.0))]
-fn measure_step<'py>(
-    py: Python<'py>,
-    shots: Vec<PyRef<'py, WeldShot>>,
-    angle_sigma_rad: f64,
-) -> PyResult<Bound<'py, PyDict>> {
-    let views: Vec<LabelledShot> = shots
-        .iter()
-        .map(|s| LabelledShot {
-            unrolled: &s.0.unrolled,
-            labels: &s.0.labels,
-            course: s.0.seam.course,
-            bead_width_mm: s.0.bead_width_mm,
-            thickness_mm: s.0.thickness_mm,
-        })
-        .collect();
-    let known = Known { at: angle_sigma_rad };
-    let step = compute(py, || step::measure(&views, &known))?;
-    let out = PyDict::new(py);
-    out.set_item("mean_mm", step.mean_mm)?;
-    out.set_item("median_mm", step.median_mm)?;
-    out.set_item("max_abs_mm", step.max_abs_mm)?;
-    out.set_item("max_abs_at_deg", step.max_abs_at)?;
-    out.set_item("expanded_mm", step.expanded_mm)?;
-    out.set_item("coverage_deg", step.coverage)?;
-    out.set_item("radius_difference_mm", step.curvature_mm)?;
-    out.set_item("axis_offset_mm", step.offset_mm)?;
-    out.set_item("axis_offset_standard_mm", step.offset_standard_mm)?;
-    out.set_item("tilt_rad", step.tilt_rad)?;
-    out.set_item("tilt_standard_rad", step.tilt_standard_rad)?;
-    out.set_item("shape_degree", step.shape_degree)?;
-    out.set_item("shrinkage_mm", step.shrinkage_mm)?;
-    out.set_item("residual_rms_mm", step.residual_rms_mm)?;
-    out.set_item("correlation_mm", step.correlation_mm)?;
-    out.set_item("effective_cells", step.effective_cells)?;
-    out.set_item("profile_columns", PROFILE_COLUMNS.to_vec())?;
-    let rows: Vec<Vec<f64>> = step
-        .profile
-        .iter()
-        .map(|b| {
-            let parts = [b.fit_mm, b.toe_mm, b.local_mm, b.place_mm, b.unevenness_mm];
-            [b.along, b.seen_along, b.step_mm, b.standard_mm].into_iter().chain(parts).collect()
-        })
-        .collect();
-    let profile = PyArray2::from_vec2(py, &rows)
-        .map_err(|e| crate::python::call::raise_as(py, "WeldscanError", e.to_string()))?;
-    out.set_item("profile", profile)?;
-    let deviations: Vec<_> = step.deviation_mm.into_iter().map(|d| d.into_pyarray(py)).collect();
-    out.set_item("deviation_mm", deviations)?;
-    Ok(out)
-}
-
 /// A shot's points, float64 of n x 3 whatever its shape, as the core's points.
 fn flat<'a>(py: Python<'_>, array: &'a PyReadonlyArrayDyn<'_, f64>) -> PyResult<&'a [[f64; 3]]> {
     let wrong = |got: String| {
@@ -360,11 +296,11 @@ fn wall_seen(py: Python<'_>, shot: PyRef<'_, WeldShot>) -> PyResult<Option<(f64,
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     agreement::register(m)?;
     paper::register(m)?;
+    step::register(m)?;
     whitening::register(m)?;
     m.add_function(wrap_pyfunction!(seam_fates, m)?)?;
     m.add_class::<WeldShot>()?;
     m.add_function(wrap_pyfunction!(wall_seen, m)?)?;
     m.add_function(wrap_pyfunction!(segment_weld, m)?)?;
-    m.add_function(wrap_pyfunction!(measure_step, m)?)?;
     m.add_function(wrap_pyfunction!(place_shots, m)?)
 }

@@ -38,13 +38,13 @@ demo: build ## a simulated cell, measured: summary and report
 	@$(BIN)/weldscan demo
 
 test: build $(VENV)/.peers ## every test, Rust and Python
-	cargo test --locked --workspace
+	cargo test --locked --workspace --profile fast
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 check: build ## format, lints, types, import contracts, documentation
 	cargo fmt --all --check
-	cargo clippy --locked --workspace --all-targets --all-features -- -D warnings
-	RUSTDOCFLAGS="-D warnings" cargo doc --locked --workspace --no-deps --quiet
+	cargo clippy --profile fast --locked --workspace --all-targets --all-features -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc --profile fast --locked --workspace --no-deps --quiet
 	! grep -rnE 'pyo3|numpy' crates/weldcore/src --include='*.rs' | grep -v '^crates/weldcore/src/python/' | grep -vE ':[0-9]+:\s*//'
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .

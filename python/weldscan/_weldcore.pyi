@@ -606,6 +606,7 @@ def segment_weld(
     axis: Sequence[float] | None = None,
     zero: Sequence[float] | None = None,
 ) -> WeldShot: ...
+
 @final
 class WeldStep:
     @property

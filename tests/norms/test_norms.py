@@ -198,7 +198,7 @@ def test_every_norm_says_where_it_comes_from():
 
 @pytest.mark.parametrize("norm_id", ["", "iso-5817", "iso-5817:A", "pnae-g-7-010-89:B", "../secret"])
 def test_an_unknown_norm_is_refused(norm_id):
-    with pytest.raises(InputError, match="there are iso-5817:B, "):
+    with pytest.raises(InputError, match=r"there are .*iso-5817:B, "):
         judge(norm_id, 0.1, 0.1, PIPE)
 
 

@@ -18,7 +18,7 @@ from weldscan import InputError, read_result
 from weldscan.records.result import BOTH_STEPS
 from weldscan.report import FATE_NAMES, FILES, write_report
 from weldscan.report.charts import Limit, arcs_of, nice_ticks, seam_chart, unseen_arcs
-from weldscan.report.pictures import diverging
+from weldscan.report.pictures import COLOURS, diverging
 from weldscan.result import CODES, FATES, Coverage, Label, Standing, Verdict, bar, note, warning
 
 DATA = Path(__file__).parents[1] / "data"
@@ -56,6 +56,7 @@ def test_result_json_keeps_its_contract(made, tmp_path):
         "reference_wall": int((label == 1).sum()),
         "other_wall": int((label == 2).sum()),
         "bead": int((label == 3).sum()),
+        "transition": int((label == 4).sum()),
     }
     assert set(result["verdicts"][0]) >= {"norm", "clause", "limit_mm", "value_mm", "verdict", "reason"}
     assert result["verdicts"][0]["verdict"] == result["verdict"] == "PASS"
@@ -467,4 +468,7 @@ def test_ticks_are_round():
 
 
 def test_labels_are_told_apart():
-    assert len({int(label) for label in Label}) == 4
+    colours = [COLOURS[label] for label in Label if label is not Label.NONE]
+    rgb = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in colours])
+    # In print too: no two are equally light.
+    assert np.diff(np.sort(rgb @ [0.299, 0.587, 0.114])).min() > 20

@@ -529,7 +529,7 @@ def _step_result(step: WeldStep, edges: EdgeProfile, part: PartSpec) -> StepResu
     read = np.isfinite(edges.step_mm[bins])
 
     def column(name: str) -> Floats:
-        return step.column(name)[read]
+        return np.asarray(step.column(name)[read])
 
     bins = bins[read]
     wall, wall_u = column("step_mm"), 2 * column("standard_mm")

@@ -39,6 +39,7 @@ CLASSES = {
     "reference_wall": Label.REFERENCE_WALL,
     "other_wall": Label.OTHER_WALL,
     "bead": Label.BEAD,
+    "transition": Label.TRANSITION,
 }
 NO_VERIFICATION = Standing("none", "no verification on record")
 

@@ -14,8 +14,13 @@ from weldscan.result import Label, PartCloud
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-# Told apart by everyone, in print as well: blue, amber and grey differ in lightness too.
-COLOURS = {Label.REFERENCE_WALL: "#3f72af", Label.OTHER_WALL: "#e8a33d", Label.BEAD: "#8b94a1"}
+# Told apart by everyone, in print as well: they differ in lightness too.
+COLOURS = {
+    Label.REFERENCE_WALL: "#3f72af",
+    Label.OTHER_WALL: "#e8a33d",
+    Label.BEAD: "#8b94a1",
+    Label.TRANSITION: "#8c1d40",
+}
 MAP_ROWS = 150
 MAP_COLUMNS = 620
 # Points that the pictures are made of; more would not be seen.
@@ -99,7 +104,7 @@ def deviation_map(cloud: PartCloud, extent: Extent, scale_mm: float) -> list[str
 
 
 def cloud_view(cloud: PartCloud, width: int = 1100, height: int = 480) -> str | None:
-    """The cloud from outside the pipe in three colours, through a z-buffer and lit from the side; None if it is empty.
+    """The cloud from outside the pipe in the colours of its labels, through a z-buffer and lit from the side; None if it is empty.
 
     Where the pipe stands is read off the cloud itself: but for the deviation, the position is linear in `axial_mm` and
     in the cosine and sine of `angle_deg`.

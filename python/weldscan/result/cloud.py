@@ -18,6 +18,7 @@ class Label(IntEnum):
     REFERENCE_WALL = 1
     OTHER_WALL = 2
     BEAD = 3
+    TRANSITION = 4
 
 
 @dataclass(frozen=True, eq=False)

@@ -96,8 +96,8 @@ impl WeldShot {
     }
     /// The cross-sections along the seam: a dict of arrays over the stations (n,), NaN for what is not known: `along`
     /// (middle of the station, as a reading of the seam; also as `angle_deg`), `seen` (bool), `kind` (uint8: 0 unknown, 1 raised, 2 hollow, 3 flush), `by_course` (bool: the
-    /// toes are those of the seam's course), `toes_mm` (n, 2) from the seam's centreline, reference side first, `height_mm` of
-    /// the cap, `edge_step_mm` (other over reference, right beside the toes), `edge_standard_mm` (k = 1), `edge_hull_mm` (what the
+    /// toes are those of the seam's course), `toes_mm` (n, 2) from the seam's centreline, reference side first, with their standard uncertainty
+    /// `toes_standard_mm` (n, 2), `height_mm` of the cap, `edge_step_mm` (other over reference, right beside the toes), `edge_standard_mm` (k = 1), `edge_hull_mm` (what the
     /// choice of the toes may hide, in full), `undisturbed_mm` (n, 2): from where outward the walls are undisturbed,
     /// `departure_mm` (n, 2): of the transition from the straight wall, `wall_step_mm` of both straight walls.
     #[getter]
@@ -119,6 +119,7 @@ impl WeldShot {
         out.set_item("kind", stations.iter().map(|s| s.kind as u8).collect::<Vec<u8>>().into_pyarray(py))?;
         out.set_item("by_course", stations.iter().map(|s| s.by_course).collect::<Vec<bool>>().into_pyarray(py))?;
         out.set_item("toes_mm", two(&|s| s.toes_mm.map_or([None; 2], |t| t.map(Some)))?)?;
+        out.set_item("toes_standard_mm", two(&|s| s.toes_mm.map_or([None; 2], |_| s.toes_standard_mm.map(Some)))?)?;
         out.set_item("height_mm", one(&|s| s.toes_mm.map(|_| s.height_mm)))?;
         out.set_item("edge_step_mm", one(&|s| s.edge.map(|e| e.step_mm)))?;
         out.set_item("edge_standard_mm", one(&|s| s.edge.map(|e| e.standard_mm)))?;

@@ -12,6 +12,8 @@ pub enum Label {
     OtherWall = 2,
     /// The weld metal.
     Bead = 3,
+    /// Between a toe and an undisturbed wall, off the latter.
+    Transition = 4,
 }
 
 /// What became of a point.

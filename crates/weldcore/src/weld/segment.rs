@@ -122,6 +122,7 @@ fn sort_points(sections: &Sections, unrolled: &Unrolled, thickness_mm: f64) -> (
         let label = match (fate, out < STRIP_HEIGHTS * bed.height) {
             (Fate::Wall, true) => Label::Bead,
             (Fate::Wall, false) if out >= begin - grid.bin_mm => [Label::ReferenceWall, Label::OtherWall][side],
+            (Fate::Transition, _) => Label::Transition,
             _ => Label::None,
         };
         (fate, label)

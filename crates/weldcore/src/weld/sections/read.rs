@@ -138,6 +138,11 @@ impl View<'_> {
             kind: found.kind,
             by_course,
             toes_mm: None,
+            toes_standard_mm: if found.kind == Kind::Flush {
+                [FLUSH_GAPS[1] * self.widest_mm / toes::PLAUSIBLE_SIGMAS; 2]
+            } else {
+                toes.map(|toe| (toe.to - toe.from) / (2.0 * toes::PLAUSIBLE_SIGMAS))
+            },
             height_mm: 0.0,
             edge: None,
             undisturbed_mm: [None; 2],

@@ -51,6 +51,8 @@ pub struct Station {
     pub by_course: bool,
     /// Both toes across the seam: reference side, other side.
     pub toes_mm: Option<[f64; 2]>,
+    /// Standard uncertainty of each toe: a sixth of the range in which it may as well be.
+    pub toes_standard_mm: [f64; 2],
     /// Height of the cap over the chord between the toes.
     pub height_mm: f64,
     /// The edge step, where both surfaces beside the toes are there.

@@ -13,8 +13,10 @@ const BEYOND_MM: f64 = 5.0;
 const BEYOND_WIDTHS: f64 = 0.25;
 /// Bins further than this from both parabolas are spatter or holes' edges (MADs; once).
 const CLIP_MADS: f64 = 3.0;
-/// Toes whose sum of squares is this much larger (in units of the residual's variance) are as plausible: three sigma.
+/// Toes whose sum of squares is this much larger (in units of the residual's variance) are as plausible.
 const PLAUSIBLE: f64 = 10.0;
+/// The range of plausible toes reaches to so many standard deviations, as chi-square has it for one place.
+pub(super) const PLAUSIBLE_SIGMAS: f64 = 3.0;
 
 /// A toe with the range in which it may as well be.
 #[derive(Debug, Clone, Copy, PartialEq)]

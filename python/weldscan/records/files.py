@@ -18,6 +18,7 @@ import shutil
 import stat
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -331,7 +332,9 @@ def to_json(document: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Python's own types all through, and None for NaN and infinity."""
+    """Python's own types all through, a dataclass by its fields' names, and None for NaN and infinity."""
+    if is_dataclass(value):
+        value = vars(value)
     if isinstance(value, Mapping):
         return {str(name): plain(item) for name, item in value.items()}
     if isinstance(value, str):

@@ -18,15 +18,11 @@ from weldscan.records.files import is_earlier, plain, read_json
 from weldscan.records.part import course_of
 from weldscan.result import (
     FATES,
-    ArtefactShot,
     Coverage,
-    Finding,
-    HandEye,
     Inspection,
     Judgement,
     Label,
     PartCloud,
-    SeamBin,
     Standing,
     StepResult,
     Verdict,
@@ -60,7 +56,7 @@ def is_result(folder: Path) -> bool:
 
 def result_document(inspection: Inspection, created: datetime) -> dict[str, Any]:
     """`weldscan-result/2` as plain data; what has no value is null or absent, never NaN."""
-    step, hand_eye = inspection.step, inspection.hand_eye
+    step = inspection.step
     document = {
         "schema": SCHEMA,
         "report": report_id(inspection, created),
@@ -74,31 +70,28 @@ def result_document(inspection: Inspection, created: datetime) -> dict[str, Any]
         "judged_mm": inspection.judged_mm,
         "step_mm": _step(step),
         "profile": profile(step, inspection.part),
-        "seam": [_seam_bin(each) for each in inspection.seam],
+        "seam": [vars(each) | {"fate": {name: each.fate.get(name, 0) for name in FATES}} for each in inspection.seam],
         "coverage": _coverage(inspection.coverage, inspection.seen_deg),
-        "uncertainty_budget": [
-            {"name": line.name, "standard_mm": line.standard_mm, "derived_from": line.derived_from}
-            for line in (step.budget if step else ())
-        ],
-        "calibration": inspection.calibration,
-        "scanner": None if inspection.scanner is None else vars(inspection.scanner),
-        "hand_eye": _hand_eye(hand_eye),
-        "agreement": [vars(pair) for pair in inspection.agreement],
+        "uncertainty_budget": step.budget if step else (),
+        "hand_eye": None if inspection.hand_eye is None else _but(inspection.hand_eye, "centres_base_mm"),
         "counts": counts(inspection.cloud),
-        "verdicts": [_verdict(judgement) for judgement in inspection.verdicts],
+        "verdicts": [_but(judgement, "barred_by") for judgement in inspection.verdicts],
         "judgements": [_judgement(judgement) for judgement in inspection.verdicts],
-        "bars": [_bar(finding) for finding in inspection.bars],
-        "findings": [{"severity": finding.severity, **_bar(finding)} for finding in inspection.findings],
+        "bars": [_but(finding, "severity") for finding in inspection.bars],
+        "findings": inspection.findings,
         "verification": _standing(inspection.verification or NO_VERIFICATION),
         "left_out": [{"shot": shot, "reason": reason} for shot, reason in inspection.left_out],
-        "warnings": list(inspection.warnings),
-        "masks": inspection.masks,
-        "response": inspection.response,
-        "timing_s": inspection.timing_s,
+        "warnings": inspection.warnings,
         "software": {"version": __version__, **inspection.software},
     }
-    result: dict[str, Any] = plain(document)
+    # Whatever else was found is written under its own name.
+    result: dict[str, Any] = plain(document | _but(inspection, "step", "cloud", *document))
     return result
+
+
+def _but(found: Any, *names: str) -> dict[str, Any]:
+    """The fields of a frozen value, without some."""
+    return {name: value for name, value in vars(found).items() if name not in names}
 
 
 def headline_text(inspection: Inspection) -> str:
@@ -187,92 +180,14 @@ def profile_csv(step: StepResult | None, part: Mapping[str, Any]) -> str:
     return text.getvalue()
 
 
-def _seam_bin(each: SeamBin) -> dict[str, Any]:
-    return {
-        "angle_deg": each.angle_deg,
-        "along_mm": each.along_mm,
-        "measured": each.measured,
-        "fate": {name: each.fate.get(name, 0) for name in FATES},
-        "cap_width_mm": each.cap_width_mm,
-        "toes_mm": each.toes_mm,
-    }
-
-
 def _coverage(coverage: Coverage | None, seen_deg: float) -> dict[str, Any]:
     if coverage is None:
         return {"seen_deg": seen_deg, "required_deg": None, "required_by": None, "gaps": []}
-    return {
-        "seen_deg": coverage.seen_deg,
-        "required_deg": coverage.required_deg,
-        "required_by": coverage.required_by,
-        "gaps": coverage.gaps,
-    }
-
-
-def _bar(finding: Finding) -> dict[str, Any]:
-    return {"code": finding.code, "shot": finding.shot, "at_deg": finding.at_deg, "text": finding.text}
+    return vars(coverage)
 
 
 def _standing(standing: Standing) -> dict[str, Any]:
     return {**vars(standing), "good": standing.good}
-
-
-def _hand_eye(hand_eye: HandEye | None) -> dict[str, Any] | None:
-    if hand_eye is None:
-        return None
-    return {
-        "id": hand_eye.id,
-        "date": hand_eye.date,
-        "flange_from_scanner": hand_eye.flange_from_scanner,
-        "covariance": hand_eye.covariance,
-        "residual_rms_mm": hand_eye.residual_rms_mm,
-        "reduced_chi2": hand_eye.reduced_chi2,
-        "working_point_u_mm": hand_eye.working_point_u_mm,
-        "pose_sigma_mm": hand_eye.pose_sigma_mm,
-        "pose_sigma_rad": hand_eye.pose_sigma_rad,
-        "sphere_sigma_ratio": hand_eye.sphere_sigma_ratio,
-        "probe_bias_mm": hand_eye.probe_bias_mm,
-        "probe_bias_u_mm": hand_eye.probe_bias_u_mm,
-        "tilts_deg": hand_eye.tilts_deg,
-        "warnings": hand_eye.warnings,
-        "touched_distances_mm": hand_eye.touched_distances_mm,
-        "per_shot": [artefact_shot(shot) for shot in hand_eye.per_shot],
-    }
-
-
-def artefact_shot(shot: ArtefactShot) -> dict[str, Any]:
-    """One row of `hand_eye.per_shot`."""
-    return {
-        "shot": shot.shot,
-        "residual_rms_mm": shot.residual_rms_mm,
-        "left_out_error_mm": shot.left_out_error_mm,
-        "chi2": shot.chi2,
-        "outlier": shot.outlier,
-        "distances_mm": shot.distances_mm,
-        "spheres": [
-            {
-                "centre_mm": sphere.centre_mm,
-                "covariance_mm2": sphere.covariance_mm2,
-                "rms_mm": sphere.rms_mm,
-                "points": sphere.points,
-                "residual_mm": sphere.residual_mm,
-            }
-            for sphere in shot.spheres
-        ],
-    }
-
-
-def _verdict(judgement: Judgement) -> dict[str, Any]:
-    return {
-        "norm": judgement.norm,
-        "clause": judgement.clause,
-        "limit_mm": judgement.limit_mm,
-        "value_mm": judgement.value_mm,
-        "expanded_uncertainty_mm": judgement.expanded_uncertainty_mm,
-        "verdict": judgement.verdict,
-        "reason": judgement.reason,
-        "details": judgement.details,
-    }
 
 
 def _judgement(judgement: Judgement) -> dict[str, Any]:

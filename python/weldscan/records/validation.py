@@ -38,10 +38,7 @@ def validation_document(found: Validation, created: datetime) -> dict[str, Any]:
             {"point_mm": row[:3], "angle_deg": row[3], "axial_mm": row[4], "distance_mm": row[5], "u_mm": row[6]}
             for row in validation_rows(found)
         ],
-        "uncertainty_budget": [
-            {"name": line.name, "standard_mm": line.standard_mm, "derived_from": line.derived_from}
-            for line in found.budget
-        ],
+        "uncertainty_budget": found.budget,
         "software": {"version": __version__, **found.software},
     }
 

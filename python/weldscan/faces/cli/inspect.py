@@ -95,7 +95,16 @@ def inspect(
     out = out if out is not None else Path(f"{session.resolve().name}-report")
     required = None if require_coverage is None else _coverage(require_coverage)
     whole_folder.check(out, is_result)
-    found = _inspect_into(session, out, method, norms, response, history, accept_verification, required)
+    found = _inspect_into(
+        session,
+        out,
+        method=method.value,
+        norms=norms,
+        response=response,
+        history=history,
+        accept_verification=accept_verification,
+        required_coverage_deg=required,
+    )
     with terminal.answer(EXIT_CODES[found.verdict]):
         if as_json:
             _document(out)
@@ -125,7 +134,7 @@ def demo(
                 truth = None
             else:
                 truth = simulate_session(partial / "session", progress=progress)
-        found = _inspect_into(partial / "session", partial / "report", Method.surface, (DEFAULT_NORM,))
+        found = _inspect_into(partial / "session", partial / "report", norms=(DEFAULT_NORM,))
     with terminal.answer(EXIT_CODES[found.verdict]):
         _summary(found, out / "report")
         if truth is not None:
@@ -137,29 +146,15 @@ def demo(
 # --- behind the commands ----------------------------------------------------------------------------------------------
 
 
-def _inspect_into(
-    session: Path,
-    out: Path,
-    method: Method,
-    norms: tuple[str, ...],
-    response: str = "auto",
-    history: Path | None = None,
-    accept: str | None = None,
-    required_coverage_deg: float | None = None,
-) -> Inspection:
+def _inspect_into(session: Path, out: Path, **asked: Any) -> Inspection:
+    """Measures, as `weldscan.inspect` is asked to, and writes the report."""
     from weldscan.measure.inspection import inspect as measure
     from weldscan.report import write_report
 
+    # What was not asked for is left at its default.
+    given = {name: value for name, value in asked.items() if value is not None}
     with shown_progress() as progress:
-        asked = {
-            "history": history,
-            "accept_verification": accept,
-            "required_coverage_deg": required_coverage_deg,
-        }
-        given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
-        found: Inspection = measure(
-            session, method=method.value, norms=norms, response=response, progress=progress, **given
-        )
+        found: Inspection = measure(session, progress=progress, **given)
         progress(1, 1, "writing the report")
         write_report(found, out)
     return found

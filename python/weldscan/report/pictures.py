@@ -104,7 +104,7 @@ def deviation_map(cloud: PartCloud, extent: Extent, scale_mm: float) -> list[str
 
 
 def cloud_view(cloud: PartCloud, width: int = 1100, height: int = 480) -> str | None:
-    """The cloud from outside the pipe, coloured by label, through a z-buffer and lit from the side; None if it is empty.
+    """The cloud from outside the pipe, coloured by label, by a z-buffer and lit from the side; None if it is empty.
 
     Where the pipe stands is read off the cloud itself: but for the deviation, the position is linear in `axial_mm` and
     in the cosine and sine of `angle_deg`.

@@ -13,6 +13,7 @@ mod pickle;
 mod scanner;
 mod seam;
 mod simulate;
+mod step;
 mod surfaces;
 mod weld;
 
@@ -34,6 +35,7 @@ fn weldcore(m: &Bound<'_, PyModule>) -> PyResult<()> {
     clouds::register(m)?;
     seam::register(m)?;
     weld::register(m)?;
+    step::register(m)?;
     simulate::register(m)?;
     pickle::register(m)
 }

@@ -2,7 +2,6 @@
 
 mod agreement;
 mod paper;
-pub(crate) mod step;
 mod whitening;
 
 use numpy::{
@@ -297,7 +296,6 @@ fn wall_seen(py: Python<'_>, shot: PyRef<'_, WeldShot>) -> PyResult<Option<(f64,
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     agreement::register(m)?;
     paper::register(m)?;
-    step::register(m)?;
     whitening::register(m)?;
     m.add_function(wrap_pyfunction!(seam_fates, m)?)?;
     m.add_class::<WeldShot>()?;

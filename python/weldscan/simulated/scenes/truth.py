@@ -16,10 +16,19 @@ HONEST, OVER = 0.8, (1.05, 3.0)
 """Largest true step in parts of the limit: of an honest scene at most, of a defective one from and to."""
 
 
+def _edge_step(weld: SceneWeld, edges: Floats, angles: Floats) -> Floats:
+    """Return the step between the surfaces at both toes, along the bisector of the walls' directions there."""
+    slopes = [
+        wall.tilt_rad[0] * np.cos(angles) + wall.tilt_rad[1] * np.sin(angles) for wall in (weld.reference, weld.other)
+    ]
+    step: Floats = edges[:, 3] - edges[:, 2] - 0.5 * (slopes[0] + slopes[1]) * (edges[:, 1] - edges[:, 0])
+    return step
+
+
 def _steps(weld: SceneWeld, angles: Floats) -> Floats:
     """Return the step at the angles; with a second weld in view, the one of the two that is larger."""
     edges = surface_of(weld).edges(angles.ravel())
-    first, second = edges[:, 3] - edges[:, 2], edges[:, 5]
+    first, second = _edge_step(weld, edges, angles.ravel()), edges[:, 5]
     larger: Floats = np.where(np.abs(second) > np.abs(first), second, first)
     return larger.reshape(angles.shape)
 
@@ -28,8 +37,8 @@ def truth(scene: Scene) -> dict[str, Any]:
     """Return what is true of a scene.
 
     Returns:
-        `edge_step_by_deg`: other wall minus reference wall along the radius, each surface as it is at its toe (waves,
-        shrinkage, dents, machining included; spatter left out), mm, in the middle of each bin of `seen_arc`; where two
+        `edge_step_by_deg`: other wall minus reference wall, along the bisector of the two walls' directions, each surface as
+        it is at its toe (waves, shrinkage, dents, machining included; spatter left out), mm, in the middle of each bin of `seen_arc`; where two
         pipes or two welds were shot, the larger one. `range_by_deg`: the least and the largest in each bin.
         `largest` in magnitude anywhere in those bins and `largest_at_deg`; `limit_mm`; `honest`: the largest is not
         above 0.8 of the limit; `kind`, `what`.
@@ -63,11 +72,13 @@ def truth(scene: Scene) -> dict[str, Any]:
 
 
 def toes(scene: Scene, angle_deg: Sequence[float] | Floats, weld: int = 0) -> dict[str, Floats]:
-    """Return per angle the true toes (z, mm), the cap's width and its height, mm."""
-    edges = surface_of(scene.welds[weld]).edges(np.radians(angle_deg))
+    """Return per angle the true toes (z, mm), the step between the surfaces there, the cap's width and its height, mm."""
+    angles = np.radians(np.asarray(angle_deg, np.float64))
+    edges = surface_of(scene.welds[weld]).edges(angles)
     return {
         "reference_mm": edges[:, 0],
         "other_mm": edges[:, 1],
+        "step_mm": _edge_step(scene.welds[weld], edges, angles),
         "width_mm": edges[:, 1] - edges[:, 0],
         "height_mm": edges[:, 4],
     }

@@ -61,8 +61,9 @@ pub(super) fn read(profile: &Profile, toe: f64, cap_height: f64, sigma: f64) -> 
             found.push((length, fit));
         }
     }
-    // From the noisiest to the least noisy: the last that agrees with all before it.
-    found.sort_by(|a, b| b.1.variance.total_cmp(&a.1.variance).then(a.0.total_cmp(&b.0)));
+    // From the noisiest to the least noisy: the last that agrees with all before it. By what the noise alone does to each: one
+    // that runs over a kink scatters too, and would be among the first.
+    found.sort_by(|a, b| b.1.leverage.total_cmp(&a.1.leverage).then(a.0.total_cmp(&b.0)));
     let agrees =
         |i: usize| found[..i].iter().all(|(_, f)| (f.value - found[i].1.value).abs() <= 2.0 * f.variance.sqrt());
     let chosen = (0..found.len()).rev().find(|&i| agrees(i))?;
@@ -94,7 +95,10 @@ pub(super) fn read(profile: &Profile, toe: f64, cap_height: f64, sigma: f64) -> 
 struct StretchFit {
     value: f64,
     slope: f64,
+    /// Of the value, with the scatter of what was fitted.
     variance: f64,
+    /// The same with a scatter of one.
+    leverage: f64,
 }
 
 fn stretch(profile: &Profile, toe: f64, [clear, length]: [f64; 2], degree: usize, sigma: f64) -> Option<StretchFit> {
@@ -120,7 +124,8 @@ fn stretch(profile: &Profile, toe: f64, [clear, length]: [f64; 2], degree: usize
         let mut sizes: Vec<f64> = residuals.iter().map(|r| r.abs()).collect();
         let scale = (MEDIAN_TO_SIGMA * median(&mut sizes)).max(sigma).max(1e-9);
         residuals.iter().zip(weights.iter_mut()).for_each(|(r, w)| *w = huber(*r, HUBER * scale));
-        fit = Some(StretchFit { value: c[0], slope: c[1] / length, variance: scale * scale * inverse[(0, 0)] });
+        let leverage = inverse[(0, 0)];
+        fit = Some(StretchFit { value: c[0], slope: c[1] / length, variance: scale * scale * leverage, leverage });
     }
     fit
 }

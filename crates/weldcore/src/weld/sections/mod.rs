@@ -5,13 +5,15 @@
 //! 2. The cap is found as a cap (`cap`): raised (or hollow), one-humped, between smooth surfaces; or flush, as a jump. All
 //!    stations together give the seam's course.
 //! 3. Each toe is where two free parabolas meet at best, with the range that is as plausible (`toes`).
-//! 4. The surface right beside each toe is read as a gauge reads it (`edges`): the **edge step**.
+//! 4. The surface right beside each toe is read as a gauge reads it (`edges`), along the bisector of both walls (`direction`):
+//!    the **edge step**.
 //! 5. The undisturbed walls are grown inward from the edges of the view (`walls`), with what a weld draws them in.
 //!
 //! What lies between a toe and its undisturbed wall is a *transition*: a taper, a counterbore, a flare, a dent, the edge of a
 //! coat. Nothing is left out because it is inconvenient: heights are not gated, and what fits none of these is a doubt.
 
 mod cap;
+mod direction;
 mod doubts;
 mod edges;
 mod grid;

@@ -3,12 +3,13 @@
 use rayon::prelude::*;
 
 use super::cap::Candidate;
+use super::direction::Direction;
 use super::profile::Profile;
 use super::station::{Edge, Kind, Station, running_median};
 use super::toes::Toe;
 use super::view::{FLUSH_GAP_MM, Found, View};
-use super::{doubts, edges, toes, walls};
-use crate::ground::robust::median;
+use super::{direction, doubts, edges, toes, walls};
+use crate::ground::robust::{MEDIAN_TO_SIGMA, median};
 use crate::ground::threads;
 
 /// A station is seen where this part of the usual bins near the weld holds points.
@@ -74,8 +75,21 @@ impl View<'_> {
                 (0..count).filter_map(|k| Some(toes[k][side]?.at - found.course.at(self.along(k)))).collect();
             if off.is_empty() { 0.0 } else { median(&mut off) }
         });
-        let (mut stations, bevels): (Vec<Station>, Vec<Bevels>) =
+        let (mut stations, toes): (Vec<Station>, Vec<[Toe; 2]>) =
             threads::install(|| (0..count).into_par_iter().map(|k| self.station(k, found, toes[k], usual)).unzip());
+        for (side, scatter) in [0, 1].map(|side| (side, toe_scatter(&stations, side))) {
+            stations.iter_mut().for_each(|s| s.toes_standard_mm[side] = s.toes_standard_mm[side].hypot(scatter));
+        }
+        let directions = direction::directions(&stations);
+        let read: Vec<Option<(Edge, Bevels)>> = threads::install(|| {
+            let read = |k: usize| {
+                let station = &stations[k];
+                if station.toes_mm.is_some() { self.edge(k, found, station, &toes[k], directions[k]?) } else { None }
+            };
+            (0..count).into_par_iter().map(read).collect()
+        });
+        let bevels: Vec<Bevels> = read.iter().map(|read| read.map_or([None; 2], |(_, bevels)| bevels)).collect();
+        stations.iter_mut().zip(read).for_each(|(station, read)| station.edge = read.map(|(edge, _)| edge));
         let hidden = if found.kind == Kind::Flush { 0.0 } else { self.hidden(&stations) };
         // A ripple of the cap has a foot and a groove too; an end that flares has it in all neighbours.
         let feet: Vec<Option<f64>> = stations.iter().map(|s| s.edge.map(|e| e.foot_mm)).collect();
@@ -115,7 +129,8 @@ impl View<'_> {
         }
     }
 
-    fn station(&self, k: usize, found: &Found, toes: [Option<Toe>; 2], usual: [f64; 2]) -> (Station, Bevels) {
+    /// All of a station but its edge step, and its toes.
+    fn station(&self, k: usize, found: &Found, toes: [Option<Toe>; 2], usual: [f64; 2]) -> (Station, [Toe; 2]) {
         let middle = found.course.at(self.along(k));
         let by_course = toes.iter().any(Option::is_none);
         let toes: [Toe; 2] = std::array::from_fn(|side| {
@@ -151,7 +166,7 @@ impl View<'_> {
             walls: [None; 2],
         };
         if !seen {
-            return (station, [None; 2]);
+            return (station, toes);
         }
         let shell = self.grid.course.shell_mm(self.thickness_mm);
         let centre = 0.5 * (toes[0].at + toes[1].at);
@@ -169,9 +184,7 @@ impl View<'_> {
             station.departure_mm[side] = self.departure(k, &station, &toes, side);
         }
         station.height_mm = if found.kind == Kind::Flush { 0.0 } else { self.cap_height(k, [toes[0].at, toes[1].at]) };
-        let Some((edge, bevels)) = self.edge(k, found, &station, &toes) else { return (station, [None; 2]) };
-        station.edge = Some(edge);
-        (station, bevels)
+        (station, toes)
     }
 
     /// Largest departure of the transition from the straight wall, over blocks of bins. What may as well be the cap's
@@ -190,19 +203,15 @@ impl View<'_> {
     }
 
     /// The edge step of a station, and what is bevelled right beside its toes.
-    fn edge(&self, k: usize, found: &Found, station: &Station, toes: &[Toe; 2]) -> Option<(Edge, Bevels)> {
-        let slopes = [station.slope(0), station.slope(1)];
-        // Along the bisector of both walls; where one is unknown, along the other.
-        let (slope, slope_u) = match slopes {
-            [Some(a), Some(b)] => {
-                let u = station.walls.iter().flatten().map(|r| r.slope_u).fold(0.0, f64::hypot) / 2.0;
-                (0.5 * (a + b), u)
-            }
-            [Some(a), None] | [None, Some(a)] => {
-                (a, station.walls.iter().flatten().map(|r| r.slope_u).fold(0.0, f64::max))
-            }
-            [None, None] => return None,
-        };
+    fn edge(
+        &self,
+        k: usize,
+        found: &Found,
+        station: &Station,
+        toes: &[Toe; 2],
+        direction: Direction,
+    ) -> Option<(Edge, Bevels)> {
+        let slope = direction.slope;
         let read = |places: [f64; 2]| -> Option<(Edge, Bevels)> {
             let a = edges::read(&self.own[k][0], -places[0], station.height_mm, self.sigma)?;
             let b = edges::read(&self.own[k][1], places[1], station.height_mm, self.sigma)?;
@@ -220,23 +229,28 @@ impl View<'_> {
             };
             let edge = Edge {
                 step_mm: b.height - a.height - slope * width,
-                standard_mm: (a.u * a.u + b.u * b.u + (slope_u * width).powi(2)).sqrt(),
-                hull_mm: hull,
+                standard_mm: (a.u * a.u + b.u * b.u + (direction.slope_u * width).powi(2)).sqrt(),
+                hull_mm: hull + direction.spread * width,
                 foot_mm: foot,
             };
             Some((edge, if found.kind == Kind::Flush { [None; 2] } else { [a.bevel, b.bevel] }))
         };
         let middle = 0.5 * (toes[0].at + toes[1].at);
         if found.kind == Kind::Flush {
-            // Nobody knows where the toes of a ground weld were: the reading that is furthest from zero counts.
+            // Nobody knows where the toes of a ground weld were: the step is one of those that are read over several gaps.
             let gaps = std::iter::once(0.5 * FLUSH_GAP_MM)
                 .chain(FLUSH_GAPS.iter().map(|g| 0.5 * FLUSH_GAP_MM + g * self.widest_mm));
+            let all: Vec<(Edge, Bevels)> = gaps.filter_map(|half| read([middle - half, middle + half])).collect();
             let most = |e: &Edge| e.step_mm.abs() + e.expanded_mm();
-            let read = gaps.filter_map(|half| read([middle - half, middle + half]));
-            let (mut edge, bevels) = read.max_by(|a, b| most(&a.0).total_cmp(&most(&b.0)))?;
+            let (mut edge, bevels) = *all.iter().max_by(|a, b| most(&a.0).total_cmp(&most(&b.0)))?;
+            let furthest = edge.step_mm.abs();
+            let low = all.iter().map(|(e, _)| e.step_mm - e.expanded_mm()).fold(f64::INFINITY, f64::min);
+            let high = all.iter().map(|(e, _)| e.step_mm + e.expanded_mm()).fold(f64::NEG_INFINITY, f64::max);
+            edge.step_mm = 0.5 * (low + high);
+            edge.hull_mm = (0.5 * (high - low) - 2.0 * edge.standard_mm).max(0.0);
             // Nor which of the surfaces in its reach are the edges: the furthest apart of them may be.
-            let apart = self.spread(k, middle, slope) - edge.step_mm.abs();
-            edge.hull_mm = if apart > walls::TOLERANCE_MM + 3.0 * self.sigma { apart } else { 0.0 };
+            let apart = self.spread(k, middle, slope) - furthest;
+            edge.hull_mm += if apart > walls::TOLERANCE_MM + 3.0 * self.sigma { apart } else { 0.0 };
             return Some((edge, bevels));
         }
         read([toes[0].at, toes[1].at])
@@ -291,6 +305,14 @@ impl View<'_> {
             })
             .sum()
     }
+}
+
+/// How far a side's toes scatter, one sigma: by stations that share no points, as each is found in the median of three.
+fn toe_scatter(stations: &[Station], side: usize) -> f64 {
+    let toe = |s: &Station| s.toes_mm.map(|toes| toes[side]);
+    let mut apart: Vec<f64> =
+        stations.iter().zip(stations.iter().skip(3)).filter_map(|(a, b)| Some((toe(a)? - toe(b)?).abs())).collect();
+    if apart.is_empty() { 0.0 } else { MEDIAN_TO_SIGMA * median(&mut apart) / std::f64::consts::SQRT_2 }
 }
 
 /// What a bevel shorter than the strip that is not read changes at a toe: the median of neighbours, where it is more than

@@ -51,7 +51,8 @@ pub struct Station {
     pub by_course: bool,
     /// Both toes across the seam: reference side, other side.
     pub toes_mm: Option<[f64; 2]>,
-    /// Standard uncertainty of each toe: a sixth of the range in which it may as well be.
+    /// Standard uncertainty of each toe: a sixth of the range in which it may as well be, and what the toes of the view
+    /// scatter along the seam.
     pub toes_standard_mm: [f64; 2],
     /// Height of the cap over the chord between the toes.
     pub height_mm: f64,

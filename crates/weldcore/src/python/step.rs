@@ -197,7 +197,7 @@ fn measure_step(py: Python<'_>, shots: Vec<PyRef<'_, WeldShot>>, angle_sigma_rad
     compute(py, || step::measure(&views, &known)).map(WeldStep)
 }
 
-pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<WeldStep>()?;
     m.add_function(wrap_pyfunction!(measure_step, m)?)
 }

@@ -1,11 +1,11 @@
-"""Are toes and edge steps right, and is their U? Scenes of `weldscan.simulated.scenes`, segmented shot by shot and held against
-the surfaces themselves.
+"""Are toes and edge steps right, and is their U? Scenes of `weldscan.simulated.scenes`, segmented shot by shot and held
+against the surfaces themselves.
 
     python benches/sections.py --runs 10                            # clean kinds, 10 seeds each
     python benches/sections.py --kinds "taper 1:4,undercut" --runs 5 --first 100
 
-Per kind, over the stations that were read: rms and mean of the error of a toe; rms of the error of the edge step, its median U,
-and how often the truth lies within U.
+Per kind, over the stations that were read: rms and mean of the error of a toe; rms of the error of the edge step, its
+median U, and how often the truth lies within U.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def main() -> None:
         for kind, rows in pool.imap_unordered(errors_of, jobs):
             found[kind].append(rows)
     print(COLUMNS, "|".join(["", *["---"] * 8, ""]), sep="\n")
-    for kind, parts in [*found.items(), ("all", [rows for parts in found.values() for rows in parts])]:
+    for kind, parts in [*found.items(), ("all", [rows for each in found.values() for rows in each])]:
         rows = np.concatenate(parts)
         if not len(rows):
             print(f"| {kind} | 0 |" + " |" * 6)

@@ -547,7 +547,7 @@ def _step_result(step: WeldStep, edges: EdgeProfile, part: PartSpec) -> StepResu
             edges.judged is not None
             and edges.worst is not None
             and sum(edges.judged) > upper
-            and (edges.confirmed_mm > upper or edges.contradict(bins, wall, wall_u))
+            and (edges.confirmed_mm > upper or edges.disturbed or edges.contradict(bins, wall, wall_u))
         ):
             (value, u), at, judged = edges.judged, edges.course.bin_width * edges.worst, "edge"
             derived = "reading beside both toes: noise, choice of the stretch, and what the choice of the toes may hide"

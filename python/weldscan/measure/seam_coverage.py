@@ -29,6 +29,8 @@ BORDER_PX = 4.0
 UNEXPLAINED_PART = 0.10
 # Of the pixels at the weld of a bin: fewer measured ones are no sample of its surface any more.
 SATURATED_PART, LOST_PART = 0.50, 0.75
+# What drawn walls wave at most, 2.5 times 0.05 mm: what departs further is another surface.
+WAVES_MM = 0.12
 # Three sigma of what is stated with k = 2.
 CONTRADICTION = 1.5
 # A bin with points that lies so near a station that was read: a hole at the toe is no gap of the seam.
@@ -52,6 +54,8 @@ class EdgeProfile:
     """(bins,), expanded, k = 2, with what the choice of the toes may hide in full."""
     confirmed_mm: float
     """The largest |step| - U that two neighbouring stations share: a single one may be a drop of spatter."""
+    departure_mm: Floats
+    """(bins,), how far the surface beside the weld departs from the undisturbed walls; 0 where these reach the toes."""
 
     @property
     def worst(self) -> int | None:
@@ -68,6 +72,11 @@ class EdgeProfile:
         # Another bin may tell more surely that the step is large than the one that tells how large it may be.
         low, high = max(0.0, min(self.confirmed_mm, value)), value + u
         return (high + low) / 2, (high - low) / 2
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether it is no undisturbed wall that ends at the weld where the edges may stand furthest apart."""
+        return self.worst is not None and bool(self.departure_mm[self.worst] > WAVES_MM)
 
     def contradict(self, bins: NDArray[np.intp], wall_mm: Floats, wall_u_mm: Floats) -> bool:
         """Whether the edges tell another step than the walls: beyond what both leave open (k = 3 of their joint
@@ -86,7 +95,7 @@ def edge_profile(views: Sequence[PartView]) -> EdgeProfile:
     """
     course = views[0].shot.seam.course
     best_u = np.full(course.bins, np.inf)
-    step, u = np.full(course.bins, np.nan), np.full(course.bins, np.nan)
+    step, u, departure = np.full(course.bins, np.nan), np.full(course.bins, np.nan), np.zeros(course.bins)
     confirmed = 0.0
     for view in views:
         sections = view.shot.sections
@@ -106,7 +115,8 @@ def edge_profile(views: Sequence[PartView]) -> EdgeProfile:
                 # The worst of several is further off than any single one's uncertainty says.
                 chosen = abs(float(read[worst] - np.median(read[known])))
                 best_u[k], step[k], u[k] = typical, read[worst], expanded[worst] + chosen
-    return EdgeProfile(course, step, u, confirmed)
+                departure[k] = float(np.median(sections["departure_mm"][known].max(axis=1)))
+    return EdgeProfile(course, step, u, confirmed, departure)
 
 
 def _shared(read: Floats, expanded: Floats) -> tuple[Floats, Floats]:
@@ -257,6 +267,20 @@ def _stretches(course: SeamCourse, bins: set[int]) -> tuple[tuple[float, float],
     return tuple(found)
 
 
+@dataclass(frozen=True)
+class _Section:
+    """What one bin of the seam looks like across, as `SeamBin` has it."""
+
+    toes_mm: tuple[float, float]
+    toes_u_mm: tuple[float, float]
+    transition_mm: tuple[float | None, float | None]
+    transition_depth_mm: tuple[float | None, float | None]
+
+    @property
+    def width_mm(self) -> float:
+        return self.toes_mm[1] - self.toes_mm[0]
+
+
 @dataclass(frozen=True, eq=False)
 class Seam:
     """Every bin of the seam, and what there is to say of them."""
@@ -294,15 +318,18 @@ def seam_of(
     coverage = coverage_of(course, measured | beside, expected, required, required_by)
     whole = course.turn is not None and coverage.required_deg >= course.turn
     wanted = set(range(course.bins)) if whole else expected
-    caps = _caps(views)
+    sections = _sections(views)
     bins = tuple(
         SeamBin(
             angle_deg=course.bin_width * k,
             along_mm=nominal.along_mm(nominal.at(course.bin_width * k)),
             measured=k in measured,
             fate=dict(zip(FATES, every[k].tolist(), strict=True)),
-            cap_width_mm=caps[k][1] - caps[k][0] if k in caps else None,
-            toes_mm=caps.get(k),
+            cap_width_mm=sections[k].width_mm if k in sections else None,
+            toes_mm=sections[k].toes_mm if k in sections else None,
+            toes_u_mm=sections[k].toes_u_mm if k in sections else None,
+            transition_mm=sections[k].transition_mm if k in sections else None,
+            transition_depth_mm=sections[k].transition_depth_mm if k in sections else None,
         )
         for k in range(course.bins)
         if k in wanted or k in measured or every[k][POINTS].sum() >= LEAST_PIXELS
@@ -315,17 +342,29 @@ def seam_of(
     return Seam(bins, coverage, tuple(findings))
 
 
-def _caps(views: Sequence[PartView]) -> Mapping[int, tuple[float, float]]:
-    found: dict[int, tuple[float, float]] = {}
+def _sections(views: Sequence[PartView]) -> Mapping[int, _Section]:
+    """The cross-section in each bin; where two shots saw it, that with the wider cap: it is the one to worry about."""
+    found: dict[int, _Section] = {}
     for view in views:
-        toes = view.shot.sections["toes_mm"]
+        sections = view.shot.sections
+        toes, walls = sections["toes_mm"], sections["undisturbed_mm"]
+        table = np.stack(
+            [toes, sections["toes_standard_mm"], (walls - toes) * (-1.0, 1.0), sections["departure_mm"]], axis=1
+        )
         for k, stations in _stations_by_bin(view).items():
-            known = toes[stations][np.isfinite(toes[stations]).all(axis=1)]
+            known = table[stations][np.isfinite(toes[stations]).all(axis=1)]
             if len(known):
-                low, high = np.median(known, axis=0).tolist()
-                # Where two shots saw it, the wider one: it is the one to worry about.
-                if k not in found or high - low > found[k][1] - found[k][0]:
-                    found[k] = (low, high)
+                toe, u, length, depth = np.median(known, axis=0).tolist()
+                # A wall that is nowhere undisturbed has no transition: it has not ended.
+                ends = [math.isfinite(one) for one in length]
+                one = _Section(
+                    (toe[0], toe[1]),
+                    (2 * u[0], 2 * u[1]),
+                    (length[0] if ends[0] else None, length[1] if ends[1] else None),
+                    (depth[0] if ends[0] else None, depth[1] if ends[1] else None),
+                )
+                if k not in found or one.width_mm > found[k].width_mm:
+                    found[k] = one
     return found
 
 

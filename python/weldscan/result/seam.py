@@ -27,6 +27,12 @@ class SeamBin:
     cap_width_mm: float | None = None
     toes_mm: tuple[float, float] | None = None
     """Both toes, along the axis from the seam's centreline: reference side, other side."""
+    toes_u_mm: tuple[float, float] | None = None
+    """Of either, expanded (k = 2)."""
+    transition_mm: tuple[float | None, float | None] | None = None
+    """How far from either toe the undisturbed wall begins; None where none was seen."""
+    transition_depth_mm: tuple[float | None, float | None] | None = None
+    """How far the surface in between departs from that wall drawn on."""
 
 
 @dataclass(frozen=True)

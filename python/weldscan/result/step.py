@@ -60,8 +60,9 @@ class StepResult:
     not_observable: tuple[str, ...] = ()
     """Names of what this scan does not determine: less than a pipe's tolerances do."""
     judged: Literal["wall", "edge"] = "wall"
-    """Which of the two steps `step_mm` is, and the verdict is about: the walls', unless the edges contradict them and
-    have the larger upper bound. Where both tell the same, the walls tell it better."""
+    """Which of the two steps `step_mm` is, and the verdict is about: the walls', unless the edges have the larger upper
+    bound and contradict them, or the surface beside the weld is not that of the undisturbed walls. Where both tell the
+    same, the walls tell it better."""
     edge_upper_mm: float | None = None
     """Upper bound of the largest edge step, whichever is judged."""
     wall_step_mm: Floats | None = None

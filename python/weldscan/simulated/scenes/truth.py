@@ -37,9 +37,10 @@ def truth(scene: Scene) -> dict[str, Any]:
     """Return what is true of a scene.
 
     Returns:
-        `edge_step_by_deg`: other wall minus reference wall, along the bisector of the two walls' directions, each surface as
-        it is at its toe (waves, shrinkage, dents, machining included; spatter left out), mm, in the middle of each bin of `seen_arc`; where two
-        pipes or two welds were shot, the larger one. `range_by_deg`: the least and the largest in each bin.
+        `edge_step_by_deg`: other wall minus reference wall, along the bisector of the two walls' directions, each
+        surface as it is at its toe (waves, shrinkage, dents, machining included; spatter left out), mm, in the middle
+        of each bin of `seen_arc`; where two pipes or two welds were shot, the larger one. `range_by_deg`: the least and
+        the largest in each bin.
         `largest` in magnitude anywhere in those bins and `largest_at_deg`; `limit_mm`; `honest`: the largest is not
         above 0.8 of the limit; `kind`, `what`.
 
@@ -72,7 +73,7 @@ def truth(scene: Scene) -> dict[str, Any]:
 
 
 def toes(scene: Scene, angle_deg: Sequence[float] | Floats, weld: int = 0) -> dict[str, Floats]:
-    """Return per angle the true toes (z, mm), the step between the surfaces there, the cap's width and its height, mm."""
+    """Return per angle the true toes (z, mm), the step between the surfaces there, width and height of the cap, mm."""
     angles = np.radians(np.asarray(angle_deg, np.float64))
     edges = surface_of(scene.welds[weld]).edges(angles)
     return {

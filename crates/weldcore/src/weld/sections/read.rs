@@ -218,7 +218,8 @@ impl View<'_> {
             let width = places[1] - places[0];
             let leaning = [(-a.slope - slope).abs(), (b.slope - slope).abs()];
             let doubt = |side: usize| (toes[side].to - toes[side].at).max(toes[side].at - toes[side].from);
-            let (hull, foot) = if found.kind == Kind::Flush {
+            let flush = found.kind == Kind::Flush;
+            let (hull, foot) = if flush {
                 (0.0, 0.0)
             } else {
                 let foot = self.foot(k, found, toes, [a.height, b.height])
@@ -229,11 +230,14 @@ impl View<'_> {
             };
             let edge = Edge {
                 step_mm: b.height - a.height - slope * width,
-                standard_mm: (a.u * a.u + b.u * b.u + (direction.slope_u * width).powi(2)).sqrt(),
+                standard_mm: [a.u, b.u, direction.slope_u * width]
+                    .into_iter()
+                    .chain((0..2).map(|side| if flush { 0.0 } else { leaning[side] * station.toes_standard_mm[side] }))
+                    .fold(0.0, f64::hypot),
                 hull_mm: hull + direction.spread * width,
                 foot_mm: foot,
             };
-            Some((edge, if found.kind == Kind::Flush { [None; 2] } else { [a.bevel, b.bevel] }))
+            Some((edge, if flush { [None; 2] } else { [a.bevel, b.bevel] }))
         };
         let middle = 0.5 * (toes[0].at + toes[1].at);
         if found.kind == Kind::Flush {

@@ -26,7 +26,7 @@ from weldscan.records.part import PartSpec
 from weldscan.records.plan import planned
 from weldscan.records.session import Session, ShotSpec, frame_names
 from weldscan.records.shot import SHOT, Fault, ShotManifest
-from weldscan.result import Finding, HandEye, Label, bar, warning
+from weldscan.result import Finding, HandEye, bar, warning
 
 Floats = NDArray[np.float64]
 
@@ -55,6 +55,8 @@ ZERO_WARNING_DEG = 30.0
 # A girth weld is square to the pipe; a mitred one is inclined by half of what the bend turns there, 45 degrees at most.
 SEAM_WARNING_DEG = 5.0
 SEAM_BAR_DEG = 22.5
+# A line through fewer stations is a guess.
+LEAST_STATIONS = 5
 
 # --- the wall. Pipes of plant have t/D of 1/400 (large, thin) to 1/4 (small, for high pressure).
 THIN_WARNING, THIN_BAR = 1 / 420, 1 / 600
@@ -336,17 +338,15 @@ def _axis(views: Sequence[PartView], axis: Sequence[float], zero: Sequence[float
 
 def _seam(view: PartView, part: PartSpec) -> Iterator[Finding]:
     """How far from square to the pipe the bead runs."""
-    shot = view.shot
-    bead = np.flatnonzero(shot.labels == Label.BEAD)
-    if len(bead) < 100:
+    course, sections = view.shot.seam.course, view.shot.sections
+    known = np.isfinite(sections["toes_mm"]).all(axis=1)
+    if known.sum() < LEAST_STATIONS:
         return
-    course, at = shot.seam.course, shot.angle_rad[bead].astype(np.float64)
+    places = np.array([course.at(float(reading)) for reading in sections["along"][known]])
     # From the bead's own middle, so that none of it jumps by a turn.
-    along = course.along_mm(1.0) * course.places_apart(at, course.middle(at))
-    slices = np.array_split(np.argsort(along), 12)
-    across = shot.axial_mm[bead].astype(np.float64)
-    at, place = (np.array([float(np.median(values[one])) for one in slices]) for values in (along, across))
-    if np.ptp(at) < shot.bead_width_mm:
+    at = course.along_mm(1.0) * course.places_apart(places, course.middle(places))
+    place = sections["toes_mm"][known].mean(axis=1)
+    if np.ptp(at) < view.shot.bead_width_mm:
         return
     # The median slope of all pairs (Theil and Sen): a toe misread on a stretch of the arc is no inclined seam.
     i, j = np.triu_indices(len(at), 1)

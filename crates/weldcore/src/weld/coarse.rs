@@ -57,7 +57,7 @@ pub(super) fn coarse_frame(points: &[[f64; 3]], width: usize, nominal: &Nominal)
     });
     let seen: Vec<(Vec3, Vec3)> = found.into_iter().flatten().collect();
     require_count("part points with a normal", 100, seen.len())?;
-    let axis = axis_from_normals(&seen, nominal.axis)?;
+    let axis = axis_from_normals(&seen, nominal)?;
     let middle = seen.iter().map(|(p, _)| p).sum::<Vec3>() / seen.len() as f64;
     let zero = nominal.zero.unwrap_or_else(|| {
         // Towards the scanner, which is at the origin of its own frame.
@@ -70,8 +70,9 @@ pub(super) fn coarse_frame(points: &[[f64; 3]], width: usize, nominal: &Nominal)
     Ok(frame)
 }
 
-/// The direction to which the normals are most square, started at `prior` and reweighted, with its sign.
-fn axis_from_normals(seen: &[(Vec3, Vec3)], prior: Option<Vec3>) -> Result<Vec3> {
+/// The direction to which the normals are most square, started at the nominal one and reweighted, with its sign.
+fn axis_from_normals(seen: &[(Vec3, Vec3)], nominal: &Nominal) -> Result<Vec3> {
+    let prior = nominal.axis;
     let mut axis = prior.map(|a| a.normalize());
     let mut told = false;
     for _ in 0..6 {
@@ -80,19 +81,24 @@ fn axis_from_normals(seen: &[(Vec3, Vec3)], prior: Option<Vec3>) -> Result<Vec3>
             let mut lean: Vec<f64> = seen.iter().map(|(_, n)| n.dot(&a).abs()).collect();
             3.0 * MEDIAN_TO_SIGMA * median(&mut lean).max(1e-3)
         });
-        let mut spread = Matrix3::zeros();
+        let (mut spread, mut weight) = (Matrix3::zeros(), 0.0);
         for (_, n) in seen {
             let w = match (axis, scale) {
                 (Some(a), Some(s)) => tukey(n.dot(&a) / s),
                 _ => 1.0,
             };
             spread += n * n.transpose() * w;
+            weight += w;
         }
         let eigen = spread.symmetric_eigen();
         let mut order = [0, 1, 2];
         order.sort_by(|&i, &j| eigen.eigenvalues[i].total_cmp(&eigen.eigenvalues[j]));
         // On a short arc the normals hardly turn about the axis; then only what is known beforehand tells the axis.
-        told = eigen.eigenvalues[order[1]] > 4.0 * eigen.eigenvalues[order[0]];
+        let [lean, turn] = [eigen.eigenvalues[order[0]], eigen.eigenvalues[order[1]]];
+        // Nor do they where a wall so little curved would turn them less than they lean: what turns them is something else.
+        let around = eigen.eigenvectors.column(order[1]).into_owned();
+        let due = variance(seen.iter().map(|(p, _)| p.dot(&around))) / nominal.course.radius_mm().powi(2);
+        told = turn > 4.0 * lean && (prior.is_none() || due * weight > 4.0 * lean);
         if !told && prior.is_some() {
             break;
         }
@@ -108,6 +114,14 @@ fn axis_from_normals(seen: &[(Vec3, Vec3)], prior: Option<Vec3>) -> Result<Vec3>
         None => axis.y,
     };
     Ok(if sign < 0.0 { -axis } else { axis })
+}
+
+fn variance(values: impl Iterator<Item = f64>) -> f64 {
+    let (mut count, mut sum, mut square) = (0.0, 0.0, 0.0);
+    for value in values {
+        (count, sum, square) = (count + 1.0, sum + value, square + value * value);
+    }
+    (square / count - (sum / count).powi(2)).max(0.0)
 }
 
 /// Where most of `p - R n` meet across the axis: the fullest of cells of a twentieth of the radius, and its mean.

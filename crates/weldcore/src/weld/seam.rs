@@ -7,6 +7,8 @@
 
 use std::f64::consts::TAU;
 
+use nalgebra::Matrix3;
+
 use crate::error::{Error, Result, require_count, require_positive};
 use crate::ground::threads;
 use crate::ground::transform::Vec3;
@@ -283,8 +285,8 @@ impl Seam {
     }
 
     /// The seam whose surface fits the reference wall's points best by orthogonal distance, begun at this one, with what they
-    /// allow: a free radius where it is determined to better than a pipe's delivery tolerance, else the nominal one. And
-    /// whether it was free.
+    /// allow: a free radius where it is determined to better than a pipe's delivery tolerance, else the nominal one; where
+    /// they are too flat even for that, as a plane is laid on them. And whether the radius was free.
     ///
     /// # Errors
     /// [`Error::TooFew`] without points; [`Error::Degenerate`] where they are another part's.
@@ -294,7 +296,11 @@ impl Seam {
         let told = nominal.radius_mm();
         let start =
             cylinder::Cylinder { point_mm: self.origin_mm, axis: self.across, radius_mm: self.course.radius_mm() };
-        let fixed = cylinder::refine(&sample, start, false, PointNoise::default())?.surface;
+        let fixed = match cylinder::refine(&sample, start, false, PointNoise::default()) {
+            Ok(fit) => fit.surface,
+            Err(Error::Degenerate { .. }) => return Ok((self.laid_on(&sample)?, false)),
+            Err(error) => return Err(error),
+        };
         let free = cylinder::refine(&sample, fixed, true, PointNoise::default()).ok().filter(|fit| {
             let last = fit.covariance.nrows() - 1;
             let sigma = fit.covariance[(last, last)].sqrt();
@@ -315,6 +321,29 @@ impl Seam {
         // The point of the axis next to the origin so far.
         let origin = surface.point_mm + across * across.dot(&(self.origin_mm - surface.point_mm));
         Ok((Self::new(origin, across, self.zero, Course::of_radius(surface.radius_mm)?)?, fitted))
+    }
+}
+
+impl Seam {
+    /// This seam with its surface laid on points as a plane is: raised, leaned across, and rolled along.
+    fn laid_on(&self, wall: &[[f64; 3]]) -> Result<Self> {
+        let placed: Vec<[f64; 3]> = wall.iter().map(|p| self.place(p)).collect();
+        let middle = self.course.middle(placed.iter().map(|p| p[0]));
+        let (mut normal, mut right) = (Matrix3::zeros(), Vec3::zeros());
+        for [at, across, height] in placed {
+            let row = Vec3::new(1.0, across, self.course.apart(at, middle));
+            normal += row * row.transpose();
+            right += row * height;
+        }
+        let Some(factor) = normal.cholesky() else {
+            let reason = "its points lie on a line".into();
+            return Err(Error::Degenerate { what: "reference wall", reason });
+        };
+        let [raised, leaned, rolled]: [f64; 3] = factor.solve(&right).into();
+        let outward = self.outward(middle);
+        // What rises along the seam is a surface whose middle lies that much further along.
+        let origin = self.origin_mm + outward * raised + self.across.cross(&outward) * rolled;
+        Self::new(origin, self.across + outward * leaned, self.zero, self.course)
     }
 }
 
@@ -398,6 +427,24 @@ mod tests {
         };
         assert!((meet(3.0).unwrap() - Vec3::new(0.0, 0.0, 96.0)).norm() < 1e-12);
         assert!(meet(6.0).is_none());
+    }
+
+    #[test]
+    fn a_wall_too_flat_for_a_cylinder_is_laid_on_as_a_plane() {
+        let seam = Seam::new(Vec3::new(0.0, 0.0, 1e5 + 400.0), Vec3::x(), -Vec3::z(), around(1e5)).unwrap();
+        // A plane, raised, leaned and rolled against it by known amounts.
+        let height = |x: f64, y: f64| 0.7 + 0.01 * x - 0.02 * y;
+        let points: Vec<[f64; 3]> = (0..900)
+            .map(|i| (f64::from(i % 30) - 40.0, f64::from(i / 30) - 15.0))
+            .map(|(x, y)| [x, y, 400.0 - height(x, y)])
+            .collect();
+        let (found, fitted) = seam.refined(&points, around(1e5)).unwrap();
+        assert!(!fitted);
+        for p in &points {
+            let [_, _, height] = found.place(p);
+            // The pipe's own curvature over 15 mm is 0.001 mm, and tangents stand for angles.
+            assert!(height.abs() < 0.01, "{height} at {p:?}");
+        }
     }
 
     #[test]

@@ -472,3 +472,11 @@ def test_labels_are_told_apart():
     rgb = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in colours])
     # In print too: no two are equally light.
     assert np.diff(np.sort(rgb @ [0.299, 0.587, 0.114])).min() > 20
+
+
+@pytest.mark.parametrize(
+    ("judged", "said"), [("wall", "Both walls extrapolated to"), ("edge", "The surfaces right beside both")]
+)
+def test_the_curve_says_which_step_it_is(made, tmp_path, judged, said):
+    write_report(replace(made, step=replace(made.step, judged=judged)), tmp_path / "out")
+    assert said in (tmp_path / "out/report.html").read_text()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,10 @@ UNEXPLAINED_PART = 0.10
 SATURATED_PART, LOST_PART = 0.50, 0.75
 # What drawn walls wave at most, 2.5 times 0.05 mm: what departs further is another surface.
 WAVES_MM = 0.12
+# Stations of two shots read the same place where they share so much of it, in stations.
+SAME_PLACE = 0.6
+# So many stations without a reading are a gap: one may be a drop of spatter or a small hole.
+GAP_STATIONS = 1.75
 # Three sigma of what is stated with k = 2.
 CONTRADICTION = 1.5
 # A bin with points that lies so near a station that was read: a hole at the toe is no gap of the seam.
@@ -88,35 +92,77 @@ class EdgeProfile:
 
 
 def edge_profile(views: Sequence[PartView]) -> EdgeProfile:
-    """The edge step of all shots: in each bin by the shot that tells it best, there the reading furthest from zero.
+    """The edge step of all shots: at each place by the shot that tells the bin best, else by one that has read it; in
+    each bin the reading furthest from zero.
 
     Args:
         views: the segmented part shots, one at least.
     """
     course = views[0].shot.seam.course
-    best_u = np.full(course.bins, np.inf)
+    shots = [_EdgesOfShot.of(view) for view in views]
     step, u, departure = np.full(course.bins, np.nan), np.full(course.bins, np.nan), np.zeros(course.bins)
-    confirmed = 0.0
-    for view in views:
-        sections = view.shot.sections
+    for k in range(course.bins):
+        read, expanded, off = (np.concatenate(columns) for columns in zip(*_read_of_bin(shots, k), strict=True))
+        if not len(read):
+            continue
+        worst = int(np.argmax(np.abs(read) + expanded))
+        # The worst of several is further off than any single one's uncertainty says.
+        chosen = abs(float(read[worst] - np.median(read)))
+        step[k], u[k], departure[k] = read[worst], expanded[worst] + chosen, float(np.median(off))
+    return EdgeProfile(course, step, u, max((shot.confirmed_mm for shot in shots), default=0.0), departure)
+
+
+@dataclass(frozen=True, eq=False)
+class _EdgesOfShot:
+    """What the stations of one shot read, as far as neighbours share it."""
+
+    course: SeamCourse
+    along: Floats
+    """(n,), readings."""
+    reach: float
+    """Part of a station, as a difference of readings: nearer than that, two shots read the same place."""
+    step_mm: Floats
+    u_mm: Floats
+    departure_mm: Floats
+    by_bin: Mapping[int, NDArray[np.intp]]
+    confirmed_mm: float
+
+    @classmethod
+    def of(cls, view: PartView) -> Self:
+        """From a view's sections."""
+        shot, sections = view.shot, view.shot.sections
         read, expanded = _shared(sections["edge_step_mm"], 2 * sections["edge_standard_mm"] + sections["edge_hull_mm"])
-        upper, lower = np.abs(read) + expanded, np.abs(read) - expanded
+        lower = np.abs(read) - expanded
         # The same sign: two that stand off in opposite directions confirm nothing.
         pairs = np.where(np.sign(read[1:]) == np.sign(read[:-1]), np.fmin(lower[1:], lower[:-1]), np.nan)
-        if len(pairs) and not np.isnan(pairs).all():
-            confirmed = max(confirmed, float(np.nanmax(pairs)))
-        for k, stations in _stations_by_bin(view).items():
-            known = stations[np.isfinite(upper[stations])]
-            if not len(known):
-                continue
-            typical = float(np.median(expanded[known]))
-            if typical < best_u[k]:
-                worst = known[int(np.argmax(upper[known]))]
-                # The worst of several is further off than any single one's uncertainty says.
-                chosen = abs(float(read[worst] - np.median(read[known])))
-                best_u[k], step[k], u[k] = typical, read[worst], expanded[worst] + chosen
-                departure[k] = float(np.median(sections["departure_mm"][known].max(axis=1)))
-    return EdgeProfile(course, step, u, confirmed, departure)
+        known = np.isfinite(read) & np.isfinite(expanded)
+        return cls(
+            shot.seam.course,
+            sections["along"],
+            SAME_PLACE * shot.seam.course.reading_of_mm(shot.station_mm),
+            read,
+            expanded,
+            sections["departure_mm"].max(axis=1),
+            {k: found for k, near in _stations_by_bin(view).items() if len(found := near[known[near]])},
+            0.0 if not len(pairs) or np.isnan(pairs).all() else max(0.0, float(np.nanmax(pairs))),
+        )
+
+
+def _read_of_bin(shots: Sequence[_EdgesOfShot], k: int) -> list[tuple[Floats, Floats, Floats]]:
+    """Steps, their U and departures of the stations that reach into a bin. A shot that tells the bin better overrules
+    another where it has read the same place, and nowhere else: it may have seen no more than the bin's end.
+    """
+    seen = [shot for shot in shots if k in shot.by_bin]
+    taken: list[float] = []
+    found = [(np.zeros(0), np.zeros(0), np.zeros(0))]
+    for shot in sorted(seen, key=lambda shot: float(np.median(shot.u_mm[shot.by_bin[k]]))):
+        stations = shot.by_bin[k]
+        if taken:
+            apart = [np.abs(shot.course.apart(shot.along[stations], other)) for other in taken]
+            stations = stations[np.min(apart, axis=0) > shot.reach]
+        taken += shot.along[stations].tolist()
+        found.append((shot.step_mm[stations], shot.u_mm[stations], shot.departure_mm[stations]))
+    return found
 
 
 def _shared(read: Floats, expanded: Floats) -> tuple[Floats, Floats]:
@@ -334,7 +380,7 @@ def seam_of(
         for k in range(course.bins)
         if k in wanted or k in measured or every[k][POINTS].sum() >= LEAST_PIXELS
     )
-    findings = [*_of_coverage(course, coverage)]
+    findings = [*_of_coverage(course, coverage), *_of_gaps(views, expected)]
     for view, (table, near) in zip(views, tables, strict=True):
         findings += _of_fates(view, table, near, measured | expected)
         findings += [bar(code, text, view.name, along) for code, along, text in view.shot.doubts]
@@ -381,6 +427,28 @@ def _of_coverage(course: SeamCourse, coverage: Coverage) -> list[Finding]:
     at = course.told(coverage.gaps[0][0] + course.bin_width / 2) if coverage.gaps else None
     text = f"{coverage.seen_deg:.0f}{unit} of the seam were seen, {why} {coverage.required_deg:.0f}{unit}"
     return [bar("coverage", f"{text}: nothing is known of {gaps}" if gaps else text, None, at)]
+
+
+def _of_gaps(views: Sequence[PartView], expected: set[int]) -> list[Finding]:
+    """A bar where nothing was read between places that were, over two stations or more: a bin may hold several."""
+    course = views[0].shot.seam.course
+    read = [view.shot.sections["along"][np.isfinite(view.shot.sections["edge_step_mm"])] for view in views]
+    places = np.unique(np.concatenate(read))
+    station = max(view.shot.station_mm for view in views)
+    ends = [*zip(places[:-1].tolist(), places[1:].tolist(), strict=True)]
+    if course.turn is not None and len(places):
+        ends.append((float(places[-1]), float(places[0]) + course.turn))
+    longest: tuple[float, float] | None = None
+    for start, end in ends:
+        empty_mm = course.along_mm(course.at(end - start)) - station
+        middle = course.told((start + end) / 2)
+        at = int(course.bins_of(np.array([course.at(middle)]))[0])
+        if empty_mm > GAP_STATIONS * station and at in expected and (longest is None or empty_mm > longest[0]):
+            longest = empty_mm, middle
+    if longest is None:
+        return []
+    text = f"over {longest[0]:.0f} mm of the seam the weld was not read, between places where it was"
+    return [bar("coverage", text, None, longest[1])]
 
 
 def _of_fates(view: PartView, whole: NDArray[np.uint32], near: NDArray[np.uint32], judged: set[int]) -> list[Finding]:

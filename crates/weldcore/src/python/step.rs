@@ -9,8 +9,10 @@ use crate::python::call::{compute, raise};
 use crate::python::weld::WeldShot;
 use crate::weld::step::{self, Known, LabelledShot, ProfileBin, Step};
 
-/// What `profile` holds of each bin.
-const COLUMNS: [(&str, fn(&ProfileBin) -> f64); 9] = [
+/// A column of the profile: its name, and what it holds of a bin.
+type Column = (&'static str, fn(&ProfileBin) -> f64);
+
+const COLUMNS: [Column; 9] = [
     ("angle_deg", |b| b.along),
     ("seen_at_deg", |b| b.seen_along),
     ("step_mm", |b| b.step_mm),

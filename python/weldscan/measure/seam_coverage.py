@@ -380,7 +380,7 @@ def seam_of(
         for k in range(course.bins)
         if k in wanted or k in measured or every[k][POINTS].sum() >= LEAST_PIXELS
     )
-    findings = [*_of_coverage(course, coverage), *_of_gaps(views, expected)]
+    findings = [*_of_coverage(course, coverage), *_of_gaps(views, expected & (measured | beside))]
     for view, (table, near) in zip(views, tables, strict=True):
         findings += _of_fates(view, table, near, measured | expected)
         findings += [bar(code, text, view.name, along) for code, along, text in view.shot.doubts]
@@ -429,8 +429,10 @@ def _of_coverage(course: SeamCourse, coverage: Coverage) -> list[Finding]:
     return [bar("coverage", f"{text}: nothing is known of {gaps}" if gaps else text, None, at)]
 
 
-def _of_gaps(views: Sequence[PartView], expected: set[int]) -> list[Finding]:
-    """A bar where nothing was read between places that were, over two stations or more: a bin may hold several."""
+def _of_gaps(views: Sequence[PartView], counted: set[int]) -> list[Finding]:
+    """A bar where nothing was read between places that were, over two stations or more, in bins that count as seen: a
+    bin may hold several stations.
+    """
     course = views[0].shot.seam.course
     read = [view.shot.sections["along"][np.isfinite(view.shot.sections["edge_step_mm"])] for view in views]
     places = np.unique(np.concatenate(read))
@@ -443,7 +445,7 @@ def _of_gaps(views: Sequence[PartView], expected: set[int]) -> list[Finding]:
         empty_mm = course.along_mm(course.at(end - start)) - station
         middle = course.told((start + end) / 2)
         at = int(course.bins_of(np.array([course.at(middle)]))[0])
-        if empty_mm > GAP_STATIONS * station and at in expected and (longest is None or empty_mm > longest[0]):
+        if empty_mm > GAP_STATIONS * station and at in counted and (longest is None or empty_mm > longest[0]):
             longest = empty_mm, middle
     if longest is None:
         return []

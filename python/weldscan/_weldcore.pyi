@@ -30,6 +30,7 @@ __all__ = [
     "SphereFit",
     "WeakDirection",
     "WeldShot",
+    "WeldStep",
     "WeldSurface",
     "WrappedPhase",
     "__version__",

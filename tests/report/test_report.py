@@ -116,6 +116,9 @@ def test_what_bars_is_in_the_result(tmp_path):
         | {"wall": 1800, "transition": 300, "cap": 700, "gated": 900, "off_line": 40, "dark": 20},
         "cap_width_mm": 12.4,
         "toes_mm": [-6.1, 6.3],
+        "toes_u_mm": None,
+        "transition_mm": None,
+        "transition_depth_mm": None,
     }
     judgement = result["judgements"][0]
     assert judgement["barred_by"] == ["coverage", "points-without-wall", "shots-disagree"]

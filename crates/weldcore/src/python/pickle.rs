@@ -38,7 +38,7 @@ use crate::surfaces::find_spheres::FoundSphere;
 use crate::surfaces::{Cylinder, Plane, Sphere};
 use crate::weld::sections::{Doubt, Edge, Grid, Kind, Sections, Station, WallRun};
 use crate::weld::segment::Segmentation;
-use crate::weld::step::{ProfileBin, Step};
+use crate::weld::step::{LargestStep, ProfileBin, Step, Unevenness, Wave};
 use crate::weld::{Course, Seam, Unrolled};
 
 const VERSION: &str = env!("CARGO_PKG_VERSION");
@@ -206,13 +206,14 @@ structs! {
     Segmentation {
         seam, labels, unrolled, noise_mm, bead_width_mm, course_fitted, fates, thickness_mm, sections,
     }
-    ProfileBin {
-        along, seen_along, step_mm, standard_mm, fit_mm, toe_mm, local_mm, place_mm, unevenness_mm,
-    }
+    ProfileBin { along, step_mm, standard_mm, fit_mm, unevenness_mm, place_mm, band_mm, departure }
+    LargestStep { at, quantiles, interval_mm, band_factor }
+    Wave { n, amplitude_mm, standard_mm, prior_mm }
+    Unevenness { sd_mm, reach_mm, noise }
     Step {
-        mean_mm, median_mm, max_abs_mm, max_abs_at, expanded_mm, profile, coverage, curvature_mm, offset_mm,
-        offset_standard_mm, tilt_rad, tilt_standard_rad, shape_degree, shrinkage_mm, residual_rms_mm, correlation_mm,
-        effective_cells, deviation_mm,
+        mean_mm, median_mm, seam_mean_mm, largest, profile, covariance_mm2, departure_limit, coverage, curvature_mm,
+        offset_mm, offset_standard_mm, tilt_rad, tilt_standard_rad, waves, shrinkage_mm, unevenness, residual_rms_mm,
+        cells, deviation_mm,
     }
     Sample { depth_mm, column_px, row_px, deviation_mm, along, direct, ambient, label }
     Photometry { lamp, distance_mm, ambient, black, gamma, blur_px, full_well_e, read_noise_e, bits, seed }

@@ -6,37 +6,41 @@ use pyo3::prelude::*;
 
 use crate::error::Error;
 use crate::python::call::{compute, raise};
+use crate::python::convert::{float_matrix, transform};
 use crate::python::weld::WeldShot;
-use crate::weld::step::{self, Known, LabelledShot, ProfileBin, Step};
+use crate::weld::step::{self, Known, LabelledShot, ProfileBin, Step, Wave};
 
 /// A column of the profile: its name, and what it holds of a bin.
 type Column = (&'static str, fn(&ProfileBin) -> f64);
 
-const COLUMNS: [Column; 9] = [
+const COLUMNS: [Column; 8] = [
     ("angle_deg", |b| b.along),
-    ("seen_at_deg", |b| b.seen_along),
     ("step_mm", |b| b.step_mm),
     ("standard_mm", |b| b.standard_mm),
     ("fit_mm", |b| b.fit_mm),
-    ("toe_mm", |b| b.toe_mm),
-    ("local_mm", |b| b.local_mm),
-    ("angle_mm", |b| b.place_mm),
     ("unevenness_mm", |b| b.unevenness_mm),
+    ("angle_mm", |b| b.place_mm),
+    ("band_mm", |b| b.band_mm),
+    ("departure", |b| b.departure),
 ];
 
 /// The fields, which `step["mean_mm"]` gives as `step.mean_mm` does.
-const FIELDS: [&str; 19] = [
+const FIELDS: [&str; 24] = [
     "mean_mm",
     "median_mm",
+    "seam_mean_mm",
     "max_abs_mm",
     "max_abs_at_deg",
     "expanded_mm",
+    "quantiles_mm",
+    "band_factor",
     "coverage_deg",
     "radius_difference_mm",
     "axis_offset_mm",
     "axis_offset_standard_mm",
     "tilt_rad",
     "tilt_standard_rad",
+    "waves_mm",
     "shape_degree",
     "shrinkage_mm",
     "residual_rms_mm",
@@ -44,8 +48,12 @@ const FIELDS: [&str; 19] = [
     "effective_cells",
     "profile",
     "profile_columns",
+    "covariance_mm2",
     "deviation_mm",
 ];
+
+/// How large the largest step of some bins is: its median, the larger half of its 95 % interval, its quantiles 0, 1, ... 100 %, c.
+type Largest<'py> = (f64, f64, Bound<'py, PyArray1<f64>>, f64);
 
 /// The step of the other wall over the reference wall (see `measure_step`).
 ///
@@ -66,20 +74,66 @@ impl WeldStep {
     fn median_mm(&self) -> f64 {
         self.0.median_mm
     }
-    /// Largest |step| of the profile, mm.
+    /// Mean step at the seam over the profile's bins, and its standard uncertainty (k = 1), mm.
+    #[getter]
+    fn seam_mean_mm(&self) -> (f64, f64) {
+        self.0.seam_mean_mm
+    }
+    /// Largest |step| of the profile: the median of its distribution, mm.
     #[getter]
     fn max_abs_mm(&self) -> f64 {
-        self.0.max_abs_mm
+        self.0.largest.about_median().0
     }
-    /// Where that is, degrees.
+    /// Where the profile is largest, degrees.
     #[getter]
     fn max_abs_at_deg(&self) -> f64 {
-        self.0.max_abs_at
+        self.0.profile.get(self.0.largest.at).map_or(f64::NAN, |b| b.along)
     }
-    /// Expanded uncertainty (k = 2) of `max_abs_mm`, mm.
+    /// Expanded uncertainty of `max_abs_mm`: the larger half of its 95 % interval, mm.
     #[getter]
     fn expanded_mm(&self) -> f64 {
-        self.0.expanded_mm
+        self.0.largest.about_median().1
+    }
+    /// (101,) float64, mm: quantiles of the largest |step|, 0, 1, ... 100 %.
+    #[getter]
+    fn quantiles_mm<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        PyArray1::from_slice(py, &self.0.largest.quantiles)
+    }
+    /// So many standard uncertainties hold all bins at once in 95 % of all cases.
+    #[getter]
+    fn band_factor(&self) -> f64 {
+        self.0.largest.band_factor
+    }
+    /// The largest |step| of some of the profile's bins, given by their place in it: its median, the larger half of its 95 %
+    /// interval, its quantiles 0, 1, ... 100 % (101,), mm, and the factor of their band. Raises InputError without bins.
+    fn largest_of<'py>(&self, py: Python<'py>, bins: Vec<usize>) -> PyResult<Largest<'py>> {
+        let Some(found) = compute(py, || Ok(self.0.largest_of(&bins)))? else {
+            let expected = format!("some of the {} bins of the profile", self.0.profile.len());
+            return Err(raise(py, &Error::OutOfRange { what: "bins", expected, value: format!("{bins:?}") }));
+        };
+        let (median, half) = found.about_median();
+        Ok((median, half, PyArray1::from_vec(py, found.quantiles), found.band_factor))
+    }
+    /// Further Fourier terms of the step around the seam: a list of (n, cosine, sine, their standard uncertainties (k = 1), that of
+    /// each before the scan), mm, for n = 2 and up.
+    #[getter]
+    fn waves_mm(&self) -> Vec<(usize, f64, f64, f64, f64, f64)> {
+        let row = |w: &Wave| {
+            let ([c, s], [uc, us]) = (w.amplitude_mm, w.standard_mm);
+            (w.n, c, s, uc, us, w.prior_mm)
+        };
+        self.0.waves.iter().map(row).collect()
+    }
+    /// (n, n) float64, mm²: covariance of the profile's steps, without what is not known of the angle.
+    #[getter]
+    fn covariance_mm2<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let n = self.0.profile.len();
+        PyArray1::from_slice(py, &self.0.covariance_mm2).reshape([n, n])
+    }
+    /// From which size of the profile's `departure` on the walls do not run on to the cap as they run further away.
+    #[getter]
+    fn departure_limit(&self) -> f64 {
+        self.0.departure_limit
     }
     /// How much of the seam was seen on both walls, degrees.
     #[getter]
@@ -111,40 +165,50 @@ impl WeldStep {
     fn tilt_standard_rad(&self) -> f64 {
         self.0.tilt_standard_rad
     }
-    /// Legendre degree up to which the walls' shape was needed (2: their own surfaces suffice).
+    /// The highest Fourier term of the step that stands out of its uncertainty; 1 where none does.
     #[getter]
     fn shape_degree(&self) -> usize {
-        self.0.shape_degree
+        let told = |w: &&Wave| w.amplitude_mm.iter().zip(w.standard_mm).any(|(a, u)| a.abs() > 3.0 * u);
+        self.0.waves.iter().filter(told).map(|w| w.n).max().unwrap_or(1)
     }
-    /// What the weld drew the reference wall and the other wall in, mm; 0 where the data do not show it.
+    /// What the weld drew the reference wall and the other wall in, mm.
     #[getter]
     fn shrinkage_mm(&self) -> [f64; 2] {
-        self.0.shrinkage_mm
+        self.0.shrinkage_mm.map(|(value, _)| -value)
     }
     /// Rms of the walls' cells about the model, mm.
     #[getter]
     fn residual_rms_mm(&self) -> f64 {
         self.0.residual_rms_mm
     }
-    /// Where the correlation of the walls' unevenness ends, along and across the seam, mm.
+    /// Where the correlation of the less even wall's unevenness ends (below 0.04), along and across the seam, mm.
     #[getter]
     fn correlation_mm(&self) -> [f64; 2] {
-        self.0.correlation_mm
+        let [first, second] = &self.0.unevenness;
+        let wall = if first.sd_mm > second.sd_mm { first } else { second };
+        wall.reach_mm.map(|length| 3.0 * length)
     }
-    /// Effective number of independent cells.
+    /// Of each wall, reference wall first: standard deviation of the unevenness (mm), its reach along and across the seam (mm), and
+    /// the variance of a cell over what the scatter of its points makes of it.
+    #[getter]
+    fn unevenness(&self) -> [(f64, f64, f64, f64); 2] {
+        self.0.unevenness.map(|u| (u.sd_mm, u.reach_mm[0], u.reach_mm[1], u.noise))
+    }
+    /// How many independent cells on each wall would tell the mean step as well.
     #[getter]
     fn effective_cells(&self) -> f64 {
-        self.0.effective_cells
+        2.0 * (self.0.residual_rms_mm / self.0.seam_mean_mm.1).powi(2)
     }
-    /// (n, 9) float64: the bins in order along the seam, with the columns `profile_columns`.
+    /// (n, 8) float64: the bins in order along the seam, with the columns `profile_columns`.
     #[getter]
     fn profile<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let bins = &self.0.profile;
         let flat: Vec<f64> = bins.iter().flat_map(|bin| COLUMNS.map(|(_, of)| of(bin))).collect();
         flat.into_pyarray(py).reshape([bins.len(), COLUMNS.len()])
     }
-    /// Names of the profile's columns: place of the bin and mean place of what was seen of it (degrees), step, its standard
-    /// uncertainty (k = 1) and that one's parts (mm).
+    /// Names of the profile's columns: place of the bin (degrees), step, its standard uncertainty (k = 1) and that one's parts, half
+    /// width of the band that holds all bins at once (mm), and by how many standard uncertainties the step beside the cap departs from
+    /// what the walls further away predict.
     #[getter]
     fn profile_columns(&self) -> Vec<&'static str> {
         COLUMNS.iter().map(|(name, _)| *name).collect()
@@ -173,26 +237,46 @@ impl WeldStep {
         slf.getattr(name)
     }
     fn __repr__(&self) -> String {
-        let (most, u, at) = (self.0.max_abs_mm, self.0.expanded_mm, self.0.max_abs_at);
+        let ((most, u), at) = (self.0.largest.about_median(), self.max_abs_at_deg());
         format!("WeldStep(max_abs_mm={most:.3}, expanded_mm={u:.3}, at_deg={at:.1}, bins={})", self.0.profile.len())
     }
 }
 
 /// Measures the step of the other wall over the reference wall on all shots together.
 ///
-/// shots: a list of WeldShot. angle_sigma_rad: standard uncertainty of the angle about the axis (k = 1). Returns a WeldStep.
-/// Raises GeometryError where the walls do not determine it. Source: `crates/weldcore/src/weld/step/mod.rs`.
+/// shots: a list of WeldShot. angle_sigma_rad: standard uncertainty of the angle about the axis (k = 1). base_from_scanner: a (4, 4)
+/// matrix per shot; without them the frames of the shots' seams are taken for one. Returns a WeldStep. Raises InputError where
+/// there is not one matrix per shot, GeometryError where the walls do not determine the step. Source:
+/// `crates/weldcore/src/weld/step/mod.rs`.
 #[pyfunction]
-#[pyo3(signature = (shots, angle_sigma_rad=0.0))]
-fn measure_step(py: Python<'_>, shots: Vec<PyRef<'_, WeldShot>>, angle_sigma_rad: f64) -> PyResult<WeldStep> {
+#[pyo3(signature = (shots, angle_sigma_rad=0.0, base_from_scanner=None))]
+fn measure_step(
+    py: Python<'_>,
+    shots: Vec<PyRef<'_, WeldShot>>,
+    angle_sigma_rad: f64,
+    base_from_scanner: Option<Vec<Bound<'_, PyAny>>>,
+) -> PyResult<WeldStep> {
+    const NAME: &str = "base_from_scanner";
+    let poses = match base_from_scanner {
+        Some(given) if given.len() != shots.len() => {
+            let (expected, got) = (format!("{} matrices, one per shot", shots.len()), given.len().to_string());
+            return Err(raise(py, &Error::Shape { what: NAME, expected, got }));
+        }
+        Some(given) => {
+            let one = |m: &Bound<'_, PyAny>| transform(NAME, &float_matrix(NAME, m)?).map(Some);
+            given.iter().map(one).collect::<PyResult<Vec<_>>>()?
+        },
+        None => vec![None; shots.len()],
+    };
     let views: Vec<LabelledShot> = shots
         .iter()
-        .map(|s| LabelledShot {
+        .zip(poses)
+        .map(|(s, base_from_scanner)| LabelledShot {
             unrolled: &s.0.unrolled,
             labels: &s.0.labels,
-            course: s.0.seam.course,
-            bead_width_mm: s.0.bead_width_mm,
+            seam: s.0.seam,
             thickness_mm: s.0.thickness_mm,
+            base_from_scanner,
         })
         .collect();
     let known = Known { at: angle_sigma_rad };

@@ -189,6 +189,25 @@ fn segment_weld(
     segmented.map(WeldShot)
 }
 
+/// A part shot whose walls are known: takes the place of `segment_weld` where somebody else has labelled the points.
+///
+/// points_mm: (n, 3) float64, one frame. labels: (n,) uint8, `weldscan.result.Label` per point. seam: a SeamFrame, right to some
+/// millimetres; the reference wall's surface is fitted, the centreline is taken as given. Returns a WeldShot without sections. Raises
+/// InputError on bad arguments, GeometryError where the reference wall does not determine its surface.
+#[pyfunction]
+fn label_weld(
+    py: Python<'_>,
+    points_mm: &Bound<'_, PyAny>,
+    labels: PyReadonlyArray1<'_, u8>,
+    seam: &PySeam,
+    wall_thickness_mm: f64,
+) -> PyResult<WeldShot> {
+    let points_mm = floats("points_mm", points_mm)?;
+    let (points, near) = (flat(py, &points_mm)?, seam.0);
+    let labels = labels.as_slice()?;
+    compute(py, || segment::labelled(points, labels, &near, wall_thickness_mm)).map(WeldShot)
+}
+
 /// A shot's points, float64 of n x 3 whatever its shape, as the core's points.
 fn flat<'a>(py: Python<'_>, array: &'a PyReadonlyArrayDyn<'_, f64>) -> PyResult<&'a [[f64; 3]]> {
     let wrong = |got: String| {
@@ -301,5 +320,6 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<WeldShot>()?;
     m.add_function(wrap_pyfunction!(wall_seen, m)?)?;
     m.add_function(wrap_pyfunction!(segment_weld, m)?)?;
+    m.add_function(wrap_pyfunction!(label_weld, m)?)?;
     m.add_function(wrap_pyfunction!(place_shots, m)?)
 }

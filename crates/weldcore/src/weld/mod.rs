@@ -1,6 +1,7 @@
 //! The weld: its walls and cap, the step around the seam, and what became of every pixel.
 
 pub mod agreement;
+mod kriging;
 mod coarse;
 mod label;
 pub mod paper;

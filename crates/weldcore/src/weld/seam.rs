@@ -201,24 +201,6 @@ impl Course {
     pub(super) fn curvature(self, _at: f64) -> f64 {
         1.0
     }
-
-    /// What `offset` and `curvature` span, as columns of size 1 that stay apart on a short stretch, at a distance from its
-    /// middle.
-    pub(super) fn stretch_columns(self, from_middle: f64, half: f64) -> [f64; 3] {
-        [1.0, from_middle.sin() / half.sin().max(1e-9), bow(from_middle, half)]
-    }
-
-    /// How far a wall's height falls short of what is linear in its offset.
-    pub(super) fn second_order(self, offset_mm: [f64; 2], at: f64) -> f64 {
-        let (sin, cos) = at.sin_cos();
-        let across = -offset_mm[0] * sin + offset_mm[1] * cos;
-        across * across / (2.0 * self.radius_mm())
-    }
-}
-
-/// `1 - cos` of the turn, scaled to 1 at the arc's end.
-fn bow(turn: f64, half: f64) -> f64 {
-    ((turn / 2.0).sin() / (half / 2.0).sin().max(1e-9)).powi(2)
 }
 
 /// A seam in space, with the origins of its coordinates.

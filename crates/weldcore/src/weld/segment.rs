@@ -77,6 +77,41 @@ pub fn segment(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<S
     })
 }
 
+/// A shot whose points somebody else has labelled, about a seam that is roughly known: the reference wall's surface is fitted, the
+/// seam's centreline is taken as given, and nothing is examined.
+///
+/// # Errors
+/// [`Error::Shape`] unless there is a label for every point; as [`segment`] where the wall does not determine its surface.
+pub fn labelled(points: &[[f64; 3]], labels: &[u8], near: &Seam, thickness_mm: f64) -> Result<Segmentation> {
+    require_positive("wall thickness", thickness_mm)?;
+    if labels.len() != points.len() {
+        let (expected, got) = (format!("{} labels, one per point", points.len()), format!("{} labels", labels.len()));
+        return Err(Error::Shape { what: "labels", expected, got });
+    }
+    let of_reference = points.iter().zip(labels).filter(|(_, l)| **l == Label::ReferenceWall as u8);
+    let wall: Vec<[f64; 3]> = of_reference.map(|(p, _)| *p).collect();
+    let (seam, course_fitted) = near.refined(&wall, near.course)?;
+    let unrolled = Unrolled::of(points, &seam);
+    let sections = Sections::unexamined(&unrolled, seam.course, GATE_THICKNESSES * thickness_mm)?;
+    let fate = |label: &u8| match *label {
+        l if l == Label::ReferenceWall as u8 || l == Label::OtherWall as u8 => Fate::Wall as u8,
+        l if l == Label::Bead as u8 => Fate::Cap as u8,
+        l if l == Label::Transition as u8 => Fate::Transition as u8,
+        _ => Fate::None as u8,
+    };
+    Ok(Segmentation {
+        seam,
+        labels: labels.to_vec(),
+        fates: labels.iter().map(fate).collect(),
+        unrolled,
+        noise_mm: sections.noise_mm,
+        bead_width_mm: sections.cap_width_mm,
+        course_fitted,
+        thickness_mm,
+        sections,
+    })
+}
+
 /// What became of every point, from the sections: its [`Fate`] and its [`Label`].
 fn sort_points(sections: &Sections, unrolled: &Unrolled, thickness_mm: f64) -> (Vec<u8>, Vec<u8>) {
     let grid = &sections.grid;

@@ -1,6 +1,6 @@
 //! Columns of a linear model over points of one wall, divided by the root of the wall's covariance.
 //!
-//! The covariance is that of the walls' unevenness, as the step's fit has it: `wendland` of the distance over the supports
+//! The covariance is that of the walls' unevenness: `wendland` of the distance over the supports
 //! around and along the wall, and a nugget of what neighbours do not share; here in units of the unevenness' variance.
 //! Least squares of the whitened columns are generalised least squares of the plain ones.
 //!
@@ -10,7 +10,12 @@ use nalgebra::DMatrix;
 
 use crate::error::{Error, Result, require_positive};
 use crate::ground::memory::require;
-use crate::weld::step::wendland;
+
+/// Wendland's positive definite function of support 1, smooth at 0 as a Gaussian is: H. Wendland, Adv. Comput. Math. 4 (1995)
+/// 389, φ(3,1).
+fn wendland(r: f64) -> f64 {
+    if r < 1.0 { (1.0 - r).powi(4) * (4.0 * r + 1.0) } else { 0.0 }
+}
 
 /// `L⁻¹ columns`, where `L Lᵀ` is the covariance of the points.
 ///

@@ -54,6 +54,16 @@ pub struct Sections {
     pub noise_mm: f64,
 }
 
+impl Sections {
+    /// Of a view that is not examined: no stations.
+    pub(super) fn unexamined(unrolled: &Unrolled, course: Course, near_mm: f64) -> Result<Self> {
+        let grid = Grid::of(unrolled, course, near_mm)?;
+        let (station_mm, noise_mm) = (grid.station_mm, grid.noise_mm);
+        let (stations, doubts) = (Vec::new(), Vec::new());
+        Ok(Self { grid, stations, station_mm, doubts, cap_width_mm: f64::NAN, cap_height_mm: f64::NAN, noise_mm })
+    }
+}
+
 /// Examines an unrolled view of a seam between walls of `thickness_mm`; `near_mm` is how far from the nominal part points are its
 /// own beyond doubt.
 ///

@@ -1,153 +1,234 @@
-//! The walls of a shot, averaged into cells.
+//! The walls of all shots, averaged into the cells of one grid around the common seam.
 
 use rayon::prelude::*;
 
-use crate::error::{Error, Result, require_count};
+use super::view::{LabelledShot, View, is_wall};
+use crate::error::{Error, Result};
 use crate::ground::robust::median;
 use crate::ground::stop::polled;
 use crate::ground::threads;
-use crate::weld::label::Label;
-use crate::weld::seam::{Course, Unrolled};
+use crate::weld::kriging::{Cell, Line};
+use crate::weld::seam::Course;
 
-/// Cells per wall and shot: enough to see the unevenness's correlation, few enough to handle their covariance whole.
-const CELLS_PER_WALL: f64 = 700.0;
-/// Every so many points tell where the middle of a stretch is.
-const MIDDLE_STRIDE: usize = 16;
+/// Length of a cell along and across the seam, about: fine enough for waves of 8 mm.
+const CELL_MM: f64 = 5.0;
+/// A wall of a small pipe is short: at least so many rows of cells.
+const LEAST_ROWS: f64 = 8.0;
+/// At most so many: they carry the wall's unevenness across the seam.
+const MOST_ROWS: f64 = 16.0;
+/// Cells of small pipes are not shorter than this along the seam.
+const LEAST_CELL_MM: f64 = 2.0;
+/// How many columns may share a cell; they divide a turn's bins, and leave the cell's middle on a column.
+const SHARED: [usize; 5] = [1, 3, 5, 9, 15];
 /// A cell needs this part of the points of a typical cell.
 const FULL_PART: f64 = 0.25;
+/// The scatter of a cell's points is not taken to be less: no scanner is as good.
+const LEAST_SCATTER_MM: f64 = 1e-4;
+/// Two walls whose arc leaves out so much of a closed seam are an open one.
+const OPEN_GAP: f64 = 1.0 / 6.0;
 
-/// One shot, unrolled and labelled (see [`crate::weld::segment`]).
+/// The columns along a seam: bins of the profile are centred on some of them.
 #[derive(Debug, Clone, Copy)]
-pub struct LabelledShot<'a> {
-    /// The points in the seam's frame, across from its centreline.
-    pub unrolled: &'a Unrolled,
-    /// A [`Label`] per point.
-    pub labels: &'a [u8],
-    /// How the seam runs.
+pub(super) struct Columns {
     pub course: Course,
-    /// Distance between the toes.
-    pub bead_width_mm: f64,
-    /// Of the nominal wall.
-    pub thickness_mm: f64,
+    /// Around the whole seam.
+    pub around: usize,
+    /// Columns of a bin.
+    pub of_a_bin: usize,
+    /// Columns that share a cell.
+    pub of_a_cell: usize,
 }
 
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Cell {
-    pub(super) shot: usize,
-    pub(super) other: bool,
-    pub(super) at: f64,
-    pub(super) across: f64,
-    pub(super) height: f64,
-}
+impl Columns {
+    pub fn of(course: Course) -> Self {
+        let bin_mm = course.along_mm(course.at_reading(course.bin_width()));
+        let of_a_bin = ((bin_mm / CELL_MM).round() as usize).max(1);
+        let spacing = bin_mm / of_a_bin as f64;
+        let [.., last] = SHARED;
+        let of_a_cell = SHARED.into_iter().find(|n| *n as f64 * spacing >= LEAST_CELL_MM).unwrap_or(last);
+        Self { course, around: course.bins() * of_a_bin, of_a_bin, of_a_cell }
+    }
 
-/// The stretch of the seam that one shot saw: places are counted from its middle.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Stretch {
-    pub(super) middle: f64,
-    pub(super) half: f64,
-    pub(super) course: Course,
-}
+    /// In the seam's parameter.
+    pub fn spacing(&self) -> f64 {
+        self.course.at_reading(self.course.bin_width()) / self.of_a_bin as f64
+    }
 
-impl Stretch {
-    pub(super) fn local(&self, at: f64) -> f64 {
-        self.course.apart(at, self.middle)
+    /// The column in the middle of the cell that a place lies in, counted around the seam.
+    fn cell(&self, at: f64) -> usize {
+        let cell = (at / (self.spacing() * self.of_a_cell as f64)).round() as i64;
+        (cell * self.of_a_cell as i64).rem_euclid(self.around as i64) as usize
+    }
+
+    /// The middle of a column.
+    pub fn middle(&self, column: usize) -> f64 {
+        column as f64 * self.spacing()
+    }
+
+    pub fn of_bin(&self, bin: usize) -> usize {
+        bin * self.of_a_bin
     }
 }
 
-/// Sums of a wall's points over a grid of cells.
-pub(super) struct WallGrid {
-    pub(super) cells: Vec<Cell>,
-    pub(super) cell_mm: f64,
-}
+/// Sums over a cell's points, about its middle: number, place along (in the seam's parameter) and across, height, and their products.
+type Sums = [f64; 10];
 
-pub(super) fn is_wall(label: u8) -> Option<bool> {
-    match label {
-        l if l == Label::ReferenceWall as u8 => Some(false),
-        l if l == Label::OtherWall as u8 => Some(true),
-        _ => None,
+fn add(sums: &mut Sums, a: f64, z: f64, h: f64) {
+    for (slot, v) in sums.iter_mut().zip([1.0, a, z, h, a * a, a * z, z * z, a * h, z * h, h * h]) {
+        *slot += v;
     }
 }
 
-/// The stretch of a shot's walls, from the middle of what was seen of them.
-pub(super) fn stretch_of(shot: &LabelledShot) -> Result<Stretch> {
-    let mut count = [0_usize; 2];
-    shot.labels.iter().filter_map(|l| is_wall(*l)).for_each(|other| count[usize::from(other)] += 1);
-    for (what, n) in [("points of the reference wall", count[0]), ("points of the other wall", count[1])] {
-        require_count(what, 100, n)?;
+/// What is left of the heights after a plane, squared and summed, and how many differences that is of.
+fn scatter(s: &Sums) -> (f64, f64) {
+    let n = s[0];
+    let about = |product: f64, i: usize, j: usize| product - s[i] * s[j] / n;
+    let (aa, az, zz) = (about(s[4], 1, 1), about(s[5], 1, 2), about(s[6], 2, 2));
+    let (ah, zh, hh) = (about(s[7], 1, 3), about(s[8], 2, 3), about(s[9], 3, 3));
+    let det = aa * zz - az * az;
+    if n < 6.0 || det <= 1e-9 * aa * zz {
+        return (0.0, 0.0);
     }
-    let walls = || shot.unrolled.at.iter().zip(shot.labels).enumerate().filter(|(_, (_, l))| is_wall(**l).is_some());
-    // Any place about the middle will do to count from.
-    let some = walls().filter(|(i, _)| i % MIDDLE_STRIDE == 0).map(|(_, (at, _))| *at);
-    let mut stretch = Stretch { middle: shot.course.middle(some), half: 0.0, course: shot.course };
-    for (_, (at, _)) in walls() {
-        stretch.half = stretch.half.max(stretch.local(f64::from(*at)).abs());
-    }
-    if stretch.half <= 0.0 {
-        return Err(Error::Degenerate { what: "step", reason: "all points lie at one angle".into() });
-    }
-    Ok(stretch)
+    let explained = (ah * ah * zz - 2.0 * ah * zh * az + zh * zh * aa) / det;
+    ((hh - explained).max(0.0), n - 3.0)
 }
 
-pub(super) fn grid_of(index: usize, shot: &LabelledShot, stretch: &Stretch) -> Result<WallGrid> {
-    let mut low = [f64::INFINITY; 2];
-    let mut high = [f64::NEG_INFINITY; 2];
-    for (z, l) in shot.unrolled.across_mm.iter().zip(shot.labels) {
-        if let Some(other) = is_wall(*l) {
-            let k = usize::from(other);
-            low[k] = low[k].min(f64::from(*z));
-            high[k] = high[k].max(f64::from(*z));
+/// The cells of one wall.
+#[derive(Debug, Clone, Default)]
+pub(super) struct WallCells {
+    pub cells: Vec<Cell>,
+    /// Length of a row across the seam, and the extent of the wall, as distances from the centreline.
+    pub row_mm: f64,
+    pub reach_mm: [f64; 2],
+}
+
+/// The cells of both walls, in columns counted around the seam, and which bins were seen on both walls.
+pub(super) struct Gathered {
+    pub walls: [WallCells; 2],
+    pub seen: Vec<bool>,
+}
+
+/// A bin counts as seen when each wall has this part of the points of a typical bin: edges of the view fill bins partly.
+const SEEN_PART: f64 = 0.1;
+
+pub(super) fn gather(shots: &[LabelledShot], views: &[View], columns: &Columns) -> Result<Gathered> {
+    // The rows are common to all shots.
+    let mut reach = [[f64::INFINITY, 0.0_f64]; 2];
+    for view in views {
+        for (all, one) in reach.iter_mut().zip(view.reach_mm) {
+            *all = [all[0].min(one[0]), all[1].max(one[1])];
         }
     }
-    let length_mm = stretch.course.along_mm(2.0 * stretch.half);
-    let area = length_mm * (high[0] - low[0]).max(high[1] - low[1]);
-    let cell_mm = (area / CELLS_PER_WALL).sqrt();
-    if !(cell_mm.is_finite() && cell_mm > 0.0) {
+    let rows_mm = reach.map(|[from, to]| CELL_MM.min((to - from) / LEAST_ROWS).max((to - from) / MOST_ROWS));
+    if !rows_mm.iter().all(|mm| mm.is_finite() && *mm > 0.0) {
         return Err(Error::Degenerate { what: "step", reason: "the walls have no extent".into() });
     }
-    let columns = (length_mm / cell_mm) as usize + 1;
-    let rows: [usize; 2] = std::array::from_fn(|k| ((high[k] - low[k]) / cell_mm) as usize + 1);
-    let total = columns * (rows[0] + rows[1]);
-    // Along, across, height, count; one partial grid per large chunk, added in order.
+    let mut walls: [WallCells; 2] =
+        std::array::from_fn(|k| WallCells { cells: Vec::new(), row_mm: rows_mm[k], reach_mm: reach[k] });
+    let mut seen = vec![false; columns.course.bins()];
+    for (index, (shot, view)) in shots.iter().zip(views).enumerate() {
+        let found = of_shot(shot, view, columns, rows_mm, reach);
+        for (bin, counts) in found.bins.iter().enumerate() {
+            let full = |k: usize| counts[k] >= 1.0 && counts[k] >= SEEN_PART * found.typical[k];
+            seen[bin] |= full(0) && full(1);
+        }
+        for (k, wall) in walls.iter_mut().enumerate() {
+            wall.cells.extend(found.cells[k].iter().map(|c| Cell { shot: index, ..*c }));
+        }
+    }
+    Ok(Gathered { walls, seen })
+}
+
+struct OfShot {
+    cells: [Vec<Cell>; 2],
+    /// Points of each wall by bin.
+    bins: Vec<[f64; 2]>,
+    typical: [f64; 2],
+}
+
+fn of_shot(shot: &LabelledShot, view: &View, columns: &Columns, rows_mm: [f64; 2], reach: [[f64; 2]; 2]) -> OfShot {
+    let course = columns.course;
+    // Cells along the stretch of this shot alone, from its first one on.
+    let cell_at = columns.spacing() * columns.of_a_cell as f64;
+    let first = columns.cell(view.middle - view.half);
+    let along = ((2.0 * view.half / cell_at).ceil() as usize + 2).min(columns.around / columns.of_a_cell);
+    let rows: [usize; 2] = std::array::from_fn(|k| ((reach[k][1] - reach[k][0]) / rows_mm[k]).ceil() as usize + 1);
+    let total = along * (rows[0] + rows[1]);
+    let bins = course.bins();
     let indices: Vec<usize> = (0..shot.labels.len()).collect();
-    let parts: Vec<Vec<[f64; 4]>> = threads::install(|| {
+    let parts: Vec<(Vec<Sums>, Vec<[f64; 2]>)> = threads::install(|| {
         indices
-            .par_chunks(8 * threads::CHUNK)
+            .par_chunks(16 * threads::CHUNK)
             .inspect(polled)
             .map(|chunk| {
-                let mut sums = vec![[0.0; 4]; total];
+                let mut sums = vec![[0.0; 10]; total];
+                let mut counts = vec![[0.0; 2]; bins];
                 for &i in chunk {
-                    let Some(other) = is_wall(shot.labels[i]) else { continue };
-                    let k = usize::from(other);
-                    let (a, z) = (stretch.local(f64::from(shot.unrolled.at[i])), f64::from(shot.unrolled.across_mm[i]));
-                    let column = ((stretch.course.along_mm(a + stretch.half) / cell_mm) as usize).min(columns - 1);
-                    let row = (((z - low[k]) / cell_mm) as usize).min(rows[k] - 1);
-                    let slot = &mut sums[columns * (k * rows[0] + row) + column];
-                    let d = f64::from(shot.unrolled.height_mm[i]);
-                    *slot = [slot[0] + a, slot[1] + z, slot[2] + d, slot[3] + 1.0];
+                    let Some(k) = is_wall(shot.labels[i]).map(usize::from) else { continue };
+                    let [at, across, height] = view.placed(shot.unrolled, i);
+                    counts[course.bin(at)][k] += 1.0;
+                    let column = columns.cell(at);
+                    let cell = (column + columns.around - first) % columns.around / columns.of_a_cell;
+                    let row = (((across.abs() - reach[k][0]) / rows_mm[k]).max(0.0) as usize).min(rows[k] - 1);
+                    if cell < along {
+                        let slot = &mut sums[rows[0] * k * along + cell * rows[k] + row];
+                        add(slot, course.apart(at, columns.middle(column)), across, height);
+                    }
                 }
-                sums
+                (sums, counts)
             })
             .collect()
     });
-    let mut sums = vec![[0.0; 4]; total];
-    for part in parts {
-        for (a, b) in sums.iter_mut().zip(part) {
-            *a = std::array::from_fn(|k| a[k] + b[k]);
+    let (mut sums, mut counts) = (vec![[0.0; 10]; total], vec![[0.0; 2]; bins]);
+    for (part, more) in parts {
+        sums.iter_mut().zip(part).for_each(|(a, b)| a.iter_mut().zip(b).for_each(|(x, y)| *x += y));
+        counts.iter_mut().zip(more).for_each(|(a, b)| a.iter_mut().zip(b).for_each(|(x, y)| *x += y));
+    }
+    let cells = std::array::from_fn(|k| {
+        let mine = &sums[rows[0] * k * along..][..along * rows[k]];
+        let mut numbers: Vec<f64> = mine.iter().map(|s| s[0]).filter(|n| *n > 0.0).collect();
+        let full = FULL_PART * median(&mut numbers);
+        let (square, free) = mine.iter().map(scatter).fold((0.0, 0.0), |a, b| (a.0 + b.0, a.1 + b.1));
+        let variance = if free > 0.0 { square / free } else { 0.0 }.max(LEAST_SCATTER_MM * LEAST_SCATTER_MM);
+        let cell = |(at, s): (usize, &Sums)| {
+            (s[0] > 0.0 && s[0] >= full).then(|| Cell {
+                column: (first + at / rows[k] * columns.of_a_cell) % columns.around,
+                along_mm: course.along_mm(s[1] / s[0]),
+                across_mm: s[2] / s[0],
+                height_mm: s[3] / s[0],
+                weight: s[0] / variance,
+                shot: 0,
+            })
+        };
+        mine.iter().enumerate().filter_map(cell).collect()
+    });
+    let typical = std::array::from_fn(|k| {
+        let mut numbers: Vec<f64> = counts.iter().map(|c| c[k]).filter(|n| *n > 0.0).collect();
+        median(&mut numbers)
+    });
+    OfShot { cells, bins: counts, typical }
+}
+
+/// The columns that all cells lie in: around the whole seam, or from the end of the longest gap on where that is long. Returns
+/// where they begin, too.
+pub(super) fn line_of(columns: &Columns, walls: &[WallCells; 2]) -> (Line, usize) {
+    let spacing_mm = columns.course.along_mm(columns.spacing());
+    let mut used: Vec<usize> = walls.iter().flat_map(|w| w.cells.iter().map(|c| c.column)).collect();
+    used.sort_unstable();
+    used.dedup();
+    let (Some(&low), Some(&high)) = (used.first(), used.last()) else {
+        return (Line { columns: 1, spacing_mm, closed: false }, 0);
+    };
+    let (mut longest, mut start, mut end) = (low + columns.around - high, low, high);
+    for pair in used.windows(2) {
+        if pair[1] - pair[0] > longest {
+            (longest, start, end) = (pair[1] - pair[0], pair[1], pair[0] + columns.around);
         }
     }
-    let mut counts: Vec<f64> = sums.iter().map(|s| s[3]).filter(|n| *n > 0.0).collect();
-    let full = FULL_PART * median(&mut counts);
-    let cell = |(k, s): (usize, &[f64; 4])| {
-        (s[3] > 0.0 && s[3] >= full).then(|| Cell {
-            shot: index,
-            other: k >= columns * rows[0],
-            at: stretch.middle + s[0] / s[3],
-            across: s[1] / s[3],
-            height: s[2] / s[3],
-        })
-    };
-    // Wall by wall, and along the seam: neighbours in the list are neighbours on the wall, see `Whitener`.
-    let place = |k: usize, c: usize, r: usize| columns * (k * rows[0] + r) + c;
-    let turned = (0..2).flat_map(|k| (0..columns).flat_map(move |c| (0..rows[k]).map(move |r| place(k, c, r))));
-    Ok(WallGrid { cells: turned.filter_map(|i| cell((i, &sums[i]))).collect(), cell_mm })
+    if (longest as f64) < OPEN_GAP * columns.around as f64 {
+        return (Line { columns: columns.around, spacing_mm, closed: true }, 0);
+    }
+    // Bins reach a cell's half beyond its middle.
+    let margin = columns.of_a_bin.max(columns.of_a_cell);
+    (Line { columns: end - start + 1 + 2 * margin, spacing_mm, closed: false }, (start + columns.around - margin) % columns.around)
 }

@@ -1,61 +1,95 @@
 //! The step along the seam: how far the other wall stands out from the reference wall, with its uncertainty.
 //!
-//! # Model
-//! The walls of every shot are averaged into cells. In the seam's frame the height of a cell in shot k at a place θ along it
-//! and s across it (from its centreline) is
+//! All shots are unrolled about one axis: their places in base, then one cylinder on the reference wall of all of them
+//! ([`view`]). The points of each wall are averaged into the cells of one grid ([`cells`]). In the seam's frame the height of a
+//! cell of shot k at a place θ along it and s across it (from its centreline) is
 //!
-//! - on the reference wall: `ref_k(θ, s)`, a small correction of that shot's own surface (size, place, direction);
-//! - on the other wall: `ref_k(θ, s) + h(θ, s)`. What two walls can do to each other is the seam's to say
-//!   ([`Course`]); around a pipe it is `h = ΔR + e(s)·n(θ) - (e(s)×n(θ))² / 2R` with `e(s) = e0 + e1 s`: the radial
-//!   distance, to second order, of a cylinder whose radius differs by ΔR and whose axis is off by e(s).
+//! - on the reference wall: `ref(θ) + shot_k(θ, s) + drawn(θ, s) + f(θ, s) + e`,
+//! - on the other wall: `ref(θ) + h(θ, s) + shot_k(θ, s) + drawn'(θ, s) + f'(θ, s) + e`,
 //!
-//! Each shot has a reference of its own, so a robot's pose error moves both walls of a shot alike and leaves h; the
-//! parameters of h belong to the part and are common to all shots. What parts have beyond that (ovality, dents) enters as
-//! Legendre polynomials over each shot's stretch; what the weld drew each wall in enters as the bending of a thin shell
-//! ([`crate::weld::sections`]), which belongs to no step. A group of terms is admitted only where the data ask for it (Schwarz's
-//! criterion). The step at the seam is `h(θ, 0)`: both walls extrapolated to the seam.
-//! Where a bin of the profile departs from the model significantly, the departure is added: a local step is not
-//! smoothed away.
+//! with Fourier terms `ref` and `h`, what shot k is displaced by (which moves both walls alike), what the weld drew each wall in by,
+//! all with priors ([`terms`]); and each wall's own unevenness f, a Gaussian process whose scales the cells themselves tell.
+//! Both walls are kriged to the seam ([`crate::weld::kriging`]): the step is that of the surfaces there, waves and shrinkage
+//! included, with one covariance for all bins. A shot's turn about the axis is solved for in a second pass, where the walls
+//! found so far say what it changes.
 //!
-//! # Weights and uncertainty
-//! What is left after a fit is mostly the walls' own unevenness: 0.01 mm, correlated over centimetres, across the seam
-//! further than along it (pipes are drawn and ground that way). Its covariance
-//! `v(Δ) = nugget·[Δ = 0] + sill·φ(|Δ|)` is estimated from the residuals, with Wendland's φ on a support of its own in either
-//! direction, and the walls are fitted by generalised least squares with it: no number of points makes two places that
-//! belong to one wave count twice. The covariance of the parameters is that of the model that includes ΔR and tilt, whether
-//! or not these were admitted. Added in quadrature: the change of the answer when the walls' strips beside the bead are left
-//! out, the correlated unevenness itself (at the seam each wall may stand off its smooth run as far as it does
-//! elsewhere), and what the caller knows of the place.
+//! What the cap hides follows from the walls only as long as they run on to it; [`guard`] tells where they do not.
 //!
-//! Sources: GUM (JCGM 100:2008) 5.1; G. Schwarz, Ann. Statist. 6 (1978) 461, eq. 3; P. Diggle and P. Ribeiro, Model-based
-//! Geostatistics (2007), 5.2 for the covariance function of residuals; H. Wendland, Adv. Comput. Math. 4 (1995) 389, φ(3,1).
+//! Sources: N. Cressie, Statistics for Spatial Data (1993), 3.4; GUM (JCGM 100:2008) 5.2.2; JCGM 101:2008, 7.
 
 mod cells;
-mod model;
+mod fit;
+mod guard;
 mod profile;
-mod solve;
-mod unevenness;
+mod terms;
+#[cfg(test)]
+mod tests;
+mod view;
 
-use nalgebra::DVector;
-
-pub use cells::LabelledShot;
 pub use profile::ProfileBin;
+pub use view::LabelledShot;
 
-use crate::error::{Error, Result, require_count, require_positive};
+use super::kriging::{Asked, Largest, Scales, largest};
+use crate::error::{Error, Result, require_count};
 use crate::ground::memory::require;
-use crate::weld::seam::Course;
-use cells::{Cell, Stretch, WallGrid, grid_of, stretch_of};
-use model::{Model, Terms, corrected, second_order};
-use profile::{Departures, mean_and_median, seen_bins};
-use solve::{choose, solve};
-pub(crate) use unevenness::wendland;
-use unevenness::{Covariance, Whitener};
+use cells::{Columns, gather};
+use fit::{Equations, Solved};
+use guard::Guard;
+use profile::{mean_and_median, slopes};
+use terms::Terms;
+use view::{View, common_seam};
 
 /// What the caller knows of further standard uncertainties (k = 1).
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Known {
     /// Of the place along the seam (hand-eye, robot, zero mark), in its parameter.
     pub at: f64,
+}
+
+/// A Fourier term of the step around the seam: cosine and sine, their standard uncertainties, and their prior's.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Wave {
+    /// How often it goes around.
+    pub n: usize,
+    /// Cosine and sine.
+    pub amplitude_mm: [f64; 2],
+    /// Their standard uncertainties.
+    pub standard_mm: [f64; 2],
+    /// Of each, before the scan.
+    pub prior_mm: f64,
+}
+
+/// What a wall's unevenness is like.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Unevenness {
+    /// Standard deviation.
+    pub sd_mm: f64,
+    /// How far it reaches along and across the seam.
+    pub reach_mm: [f64; 2],
+    /// Variance of a cell over what the scatter of its points makes of it.
+    pub noise: f64,
+}
+
+/// How large the largest |step| of some bins is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LargestStep {
+    /// The bin, of those asked, whose largest value is likeliest: the one with the largest estimate.
+    pub at: usize,
+    /// Quantiles of the largest magnitude: 0, 1, ... 100 %.
+    pub quantiles: Vec<f64>,
+    /// The interval that holds it in 95 % of all cases.
+    pub interval_mm: [f64; 2],
+    /// So many standard uncertainties hold all bins at once in 95 % of all cases.
+    pub band_factor: f64,
+}
+
+impl LargestStep {
+    /// Its median, and the larger half of its interval.
+    pub fn about_median(&self) -> (f64, f64) {
+        let median = self.quantiles[50];
+        let [low, high] = self.interval_mm;
+        (median, (median - low).max(high - median))
+    }
 }
 
 /// The step of a weld.
@@ -65,14 +99,16 @@ pub struct Step {
     pub mean_mm: f64,
     /// Median of the same.
     pub median_mm: f64,
-    /// Largest |step| of the profile.
-    pub max_abs_mm: f64,
-    /// Where, as a reading ([`Course::reading`]).
-    pub max_abs_at: f64,
-    /// Expanded uncertainty (k = 2) of `max_abs_mm`.
-    pub expanded_mm: f64,
+    /// Mean step at the seam over the profile's bins, and its standard uncertainty.
+    pub seam_mean_mm: (f64, f64),
+    /// Of all bins of the profile.
+    pub largest: LargestStep,
     /// The profile in order along the seam.
     pub profile: Vec<ProfileBin>,
+    /// Covariance of the profile's steps, row by row; what is not known of the place along the seam is left out.
+    pub covariance_mm2: Vec<f64>,
+    /// From which departure on a bin's walls do not run on to the cap as they run further away.
+    pub departure_limit: f64,
     /// How much of the seam was seen on both walls, as a difference of readings.
     pub coverage: f64,
     /// Difference of the walls' curvature (of pipes: of their radii), other minus reference, and its standard uncertainty.
@@ -85,147 +121,182 @@ pub struct Step {
     pub tilt_rad: f64,
     /// Its standard uncertainty.
     pub tilt_standard_rad: f64,
-    /// Legendre degree up to which the walls' shape was needed (2: their own surfaces suffice).
-    pub shape_degree: usize,
-    /// What the weld drew the reference wall and the other wall in, where the data show it; else 0.
-    pub shrinkage_mm: [f64; 2],
-    /// Rms of the cells about the model.
+    /// Further Fourier terms, n = 2 and up.
+    pub waves: Vec<Wave>,
+    /// What the weld drew the reference wall and the other wall in by, each with its standard uncertainty.
+    pub shrinkage_mm: [(f64, f64); 2],
+    /// Of the reference wall and of the other wall.
+    pub unevenness: [Unevenness; 2],
+    /// Rms of the walls' cells about the terms that have a name: what unevenness and noise leave.
     pub residual_rms_mm: f64,
-    /// Distance at which the residuals' correlation ends, along and across the seam.
-    pub correlation_mm: [f64; 2],
-    /// Effective number of independent cells.
-    pub effective_cells: f64,
-    /// Per shot: the deviation of every point from the corrected reference wall.
+    /// Cells of both walls.
+    pub cells: usize,
+    /// Per shot: the deviation of every point from the reference wall.
     pub deviation_mm: Vec<Vec<f32>>,
+}
+
+impl Step {
+    /// The interval of the largest |step| about its median: the median, and the larger half.
+    pub fn max_abs_mm(&self) -> (f64, f64) {
+        self.largest.about_median()
+    }
+
+    /// How large the largest |step| of some of the profile's bins is; `None` of none.
+    pub fn largest_of(&self, bins: &[usize]) -> Option<LargestStep> {
+        let n = self.profile.len();
+        let value: Vec<f64> = bins.iter().map(|&k| self.profile.get(k).map(|b| b.step_mm)).collect::<Option<_>>()?;
+        let covariance: Vec<f64> =
+            bins.iter().flat_map(|&i| bins.iter().map(move |&j| self.covariance_mm2[i * n + j])).collect();
+        largest_step(&value, &covariance)
+    }
+}
+
+fn largest_step(value: &[f64], covariance: &[f64]) -> Option<LargestStep> {
+    let Largest { quantiles, upper, lower, band_factor } = largest(value, covariance)?;
+    let at = (0..value.len()).max_by(|a, b| value[*a].abs().total_cmp(&value[*b].abs()))?;
+    Some(LargestStep { at, quantiles, interval_mm: [lower, upper], band_factor })
 }
 
 /// Measures the step on all shots together.
 ///
 /// # Errors
 /// [`Error::Shape`] where a shot's arrays differ in length, [`Error::TooFew`] without both walls in each shot,
-/// [`Error::Degenerate`] where the walls do not determine it.
+/// [`Error::Degenerate`] where the walls do not determine it, [`Error::NotFound`] where no bin was seen on both walls.
 pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
     require_count("part shots with both walls", 1, shots.len())?;
-    for shot in shots {
-        let n = shot.labels.len();
-        if [shot.unrolled.at.len(), shot.unrolled.across_mm.len(), shot.unrolled.height_mm.len()] != [n; 3] {
-            let (expected, got) = ("arrays of one length".into(), "different lengths".into());
-            return Err(Error::Shape { what: "shot", expected, got });
-        }
-        require_positive("thickness_mm", shot.thickness_mm)?;
-    }
+    shots.iter().try_for_each(LabelledShot::check)?;
     require(shots.iter().map(|s| s.labels.len()).sum(), 24);
-    let course = Course::mean(shots.iter().map(|s| s.course));
-    let stretches = shots.iter().map(stretch_of).collect::<Result<Vec<Stretch>>>()?;
-    let grids = (0..shots.len()).map(|k| grid_of(k, &shots[k], &stretches[k])).collect::<Result<Vec<WallGrid>>>()?;
-    let cell_mm = grids.iter().map(|g| g.cell_mm).fold(0.0, f64::max);
-    let cells: Vec<Cell> = grids.into_iter().flat_map(|g| g.cells).collect();
-    let scale_mm = cells.iter().map(|c| c.across.abs()).fold(0.0, f64::max);
+    let seam = common_seam(shots)?;
+    let views = shots.iter().map(|s| View::of(s, &seam)).collect::<Result<Vec<View>>>()?;
+    let columns = Columns::of(seam.course);
+    let gathered = gather(shots, &views, &columns)?;
     let thickness_mm = shots.iter().map(|s| s.thickness_mm).sum::<f64>() / shots.len() as f64;
-    let model = |terms: Terms| Model { course, stretches: &stretches, terms, scale_mm, thickness_mm };
-
-    // Plain least squares first, to see what the walls' unevenness is like.
-    let plain = Whitener::identity(cells.len());
-    let rough = solve(&model(choose(&model, &cells, &plain)?.widened()), &cells, &plain)?;
-    let covariance = Covariance::of(&stretches, &cells, &rough.residuals, cell_mm);
-    let whitener = Whitener::of(&stretches, &cells, &covariance);
-    let terms = choose(&model, &cells, &whitener)?;
-    let chosen = solve(&model(terms), &cells, &whitener)?;
-    let wide_terms = terms.widened();
-    let wide = solve(&model(wide_terms), &cells, &whitener)?;
-
-    // Without the strip beside the bead: half a bead's width.
-    let bead_mm = shots.iter().map(|s| s.bead_width_mm).fold(0.0, f64::max);
-    let nearest =
-        |other: bool| cells.iter().filter(|c| c.other == other).map(|c| c.across.abs()).fold(f64::INFINITY, f64::min);
-    let limits = [nearest(false) + bead_mm / 2.0, nearest(true) + bead_mm / 2.0];
-    let far: Vec<Cell> = cells.iter().filter(|c| c.across.abs() > limits[usize::from(c.other)]).copied().collect();
-    let without_strip = solve(&model(terms), &far, &Whitener::of(&stretches, &far, &covariance)).ok();
-
-    let deviation_mm: Vec<Vec<f32>> =
-        (0..shots.len()).map(|k| corrected(&model(terms), &chosen.parameters, k, &shots[k])).collect();
-    let (mean_mm, median_mm) = mean_and_median(shots, &deviation_mm);
-
-    // Each wall ends at the seam as uneven as it is elsewhere.
-    let unevenness_mm = (2.0 * covariance.sill).sqrt();
-    let departures = Departures {
-        course,
-        stretches: &stretches,
-        cells: &cells,
-        residuals: &chosen.residuals,
-        covariance: &covariance,
+    let posed = shots.iter().all(|s| s.base_from_scanner.is_some());
+    let terms = Terms::new(seam.course, thickness_mm, views.iter().map(|v| v.middle).collect(), posed);
+    let equations = Equations::of(columns, &gathered, terms);
+    let (rows_mm, reach_mm) = (gathered.walls.each_ref().map(|w| w.row_mm), gathered.walls.each_ref().map(|w| w.reach_mm));
+    let bins: Vec<usize> = (0..gathered.seen.len())
+        .filter(|bin| gathered.seen[*bin] && equations.column_of_bin(*bin).is_some())
+        .collect();
+    if bins.is_empty() {
+        return Err(Error::NotFound { what: "step", reason: "no angle at which both walls were seen".into() });
+    }
+    let near = equations.scales(None)?;
+    let guard = Guard::of(&equations, near, rows_mm, reach_mm)?;
+    let (mut scales, mut solved) = (near, at_seam(&equations, &near, &bins, posed)?);
+    let mut found = largest_step(&solved.answer.value, &solved.answer.covariance);
+    let departure_limit = Guard::limit(found.as_ref().map_or(0.0, |f| f.band_factor));
+    if guard.departures.iter().flatten().any(|z| z.abs() > departure_limit) {
+        // What lies beside the cap must not say what is usual.
+        scales = guard.scales;
+        solved = at_seam(&equations, &scales, &bins, posed)?;
+        found = largest_step(&solved.answer.value, &solved.answer.covariance);
+    }
+    let Some(largest) = found else {
+        return Err(Error::Degenerate { what: "step", reason: "its uncertainty is none".into() });
     };
-    let step_at = |terms: Terms, parameters: &DVector<f64>, shot: usize, at: f64| {
-        let m = model(terms);
-        let mut row = vec![0.0; m.columns()];
-        m.step_row(Some(shot), at, 0.0, &mut row);
-        DVector::from_vec(row).dot(parameters) - second_order(&m, parameters, at, 0.0)
-    };
-    let mut profile = Vec::new();
-    for seen in seen_bins(course, shots) {
-        let (at, shot) = (seen.at, seen.shot);
-        let smooth = step_at(terms, &chosen.parameters, shot, at);
-        let mut row = vec![0.0; model(wide_terms).columns()];
-        model(wide_terms).step_row(Some(shot), at, 0.0, &mut row);
-        let row = DVector::from_vec(row);
-        let fit_mm = row.dot(&(&wide.covariance * &row)).max(0.0).sqrt();
-        let toe_mm = without_strip
-            .as_ref()
-            .map_or(smooth.abs(), |s| (step_at(terms, &s.parameters, shot, at) - smooth).abs() / 3f64.sqrt());
-        let (local, local_mm) = departures.of(shot, seen.index);
-        let slope = (step_at(terms, &chosen.parameters, shot, at + 1e-4)
-            - step_at(terms, &chosen.parameters, shot, at - 1e-4))
-            / 2e-4;
-        let place_mm = slope.abs() * known.at;
-        let parts = [fit_mm, toe_mm, local_mm, place_mm, unevenness_mm];
+    let Solved { border, answer } = &solved;
+    let terms = &equations.terms;
+
+    let course = seam.course;
+    let n = bins.len();
+    let slopes = slopes(&bins, course.bins(), course.at_reading(course.bin_width()), &answer.value);
+    let mut profile = Vec::with_capacity(n);
+    for (k, &bin) in bins.iter().enumerate() {
+        let at = course.bin_middle(bin);
+        // The nearest shot's doubt about its own axis is one about the angle.
+        let nearest = (0..views.len()).min_by(|a, b| {
+            let apart = |v: usize| course.apart(at, views[v].middle).abs();
+            apart(*a).total_cmp(&apart(*b))
+        });
+        let aside = border.spread(&terms.aside_row(nearest.unwrap_or(0), at))[0].sqrt();
+        let place_mm = slopes[k].abs() * known.at.hypot(course.difference(aside));
+        let variance = answer.covariance[k * n + k];
+        let standard_mm = variance.sqrt().hypot(place_mm);
         profile.push(ProfileBin {
-            along: course.bin_reading(seen.index),
-            seen_along: course.reading(at),
-            step_mm: smooth + local,
-            standard_mm: parts.iter().map(|p| p * p).sum::<f64>().sqrt(),
-            fit_mm,
-            toe_mm,
-            local_mm,
+            along: course.bin_reading(bin),
+            step_mm: answer.value[k],
+            standard_mm,
+            fit_mm: (variance - answer.of_unevenness[k]).max(0.0).sqrt(),
+            unevenness_mm: answer.of_unevenness[k].max(0.0).sqrt(),
             place_mm,
-            unevenness_mm,
+            band_mm: largest.band_factor * standard_mm,
+            departure: guard.departures[bin].unwrap_or(f64::NAN),
         });
     }
-    let Some(largest) = profile.iter().max_by(|a, b| a.step_mm.abs().total_cmp(&b.step_mm.abs())) else {
-        return Err(Error::NotFound { what: "step", reason: "no angle at which both walls were seen".into() });
+    let estimate = &border.estimate;
+    let deviation_mm: Vec<Vec<f32>> = views
+        .iter()
+        .zip(shots)
+        .enumerate()
+        .map(|(k, (view, shot))| view.over(shot, |at, across| terms.reference_height(estimate, k, at, across)))
+        .collect();
+    let (mean_mm, median_mm) = mean_and_median(shots, &deviation_mm);
+    let told = |row: &[f64]| {
+        let value: f64 = row.iter().zip(estimate).map(|(a, b)| a * b).sum();
+        (value, border.spread(row)[0].sqrt())
     };
-    let first = wide.parameters.len() - model(wide_terms).step_columns();
-    let p = &wide.parameters.as_slice()[first..];
-    // Of a vector's length: its covariance along its own direction.
-    let along = |k: usize| {
-        let v = nalgebra::Vector2::new(p[k], p[k + 1]);
-        let u = v.try_normalize(0.0).unwrap_or(nalgebra::Vector2::x());
-        let c = wide.covariance.fixed_view::<2, 2>(first + k, first + k);
-        u.dot(&(c * u)).max(0.0).sqrt()
+    let pair = |rows: [Vec<f64>; 2]| {
+        let value = rows.each_ref().map(|r| told(r).0);
+        // Of a vector's length: its covariance along its own direction.
+        let length = value[0].hypot(value[1]);
+        let towards = if length > 0.0 { value.map(|v| v / length) } else { [1.0, 0.0] };
+        let along: Vec<f64> =
+            rows[0].iter().zip(&rows[1]).map(|(a, b)| towards[0] * a + towards[1] * b).collect();
+        (value, told(&along).1)
     };
+    let ((offset_mm, offset_standard_mm), (lean, tilt_standard_rad)) = (pair(terms.offset_rows()), pair(terms.lean_rows()));
+    let waves = terms.round_rows().map(|(n, rows, prior_mm)| {
+        let [c, s] = rows.map(|r| told(&r));
+        Wave { n, amplitude_mm: [c.0, s.0], standard_mm: [c.1, s.1], prior_mm }
+    });
+    let mean_variance = answer.covariance.iter().sum::<f64>() / (n * n) as f64;
+    let of_place = profile.iter().map(|b| b.place_mm).sum::<f64>() / n as f64;
+    let left = equations.residuals(estimate);
     Ok(Step {
         mean_mm,
         median_mm,
-        max_abs_mm: largest.step_mm.abs(),
-        max_abs_at: largest.along,
-        expanded_mm: 2.0 * largest.standard_mm,
-        coverage: course.bin_width() * profile.len() as f64,
-        curvature_mm: (p[2], wide.covariance[(first + 2, first + 2)].max(0.0).sqrt()),
-        offset_mm: [p[0], p[1]],
-        offset_standard_mm: along(0),
-        tilt_standard_rad: along(3) / scale_mm,
-        tilt_rad: (p[3].hypot(p[4]) / scale_mm).atan(),
-        shape_degree: terms.shape,
-        shrinkage_mm: {
-            let mut drawn = model(terms).shell_columns().map(|k| chosen.parameters[k]);
-            std::array::from_fn(|_| drawn.next().unwrap_or(0.0))
-        },
-        residual_rms_mm: (chosen.residuals.iter().map(|r| r * r).sum::<f64>() / cells.len() as f64).sqrt(),
-        correlation_mm: covariance.support_mm,
-        effective_cells: whitener.effective_count(covariance.nugget + covariance.sill),
+        seam_mean_mm: (answer.value.iter().sum::<f64>() / n as f64, mean_variance.max(0.0).sqrt().hypot(of_place)),
+        largest,
+        coverage: course.bin_width() * n as f64,
+        curvature_mm: told(&terms.radius_row()),
+        offset_mm,
+        offset_standard_mm,
+        tilt_rad: lean[0].hypot(lean[1]).atan(),
+        tilt_standard_rad,
+        waves: waves.collect(),
+        shrinkage_mm: terms.drawn_rows().map(|row| told(&row)),
+        unevenness: scales.map(|s| Unevenness {
+            sd_mm: s.sd_mm,
+            reach_mm: [s.along_mm, s.across_mm],
+            noise: s.noise,
+        }),
+        residual_rms_mm: (left.iter().map(|r| r * r).sum::<f64>() / left.len() as f64).sqrt(),
+        cells: left.len(),
+        covariance_mm2: answer.covariance.clone(),
+        departure_limit,
         profile,
         deviation_mm,
     })
 }
 
-#[cfg(test)]
-mod tests;
+/// The step at the middles of bins. Several shots turn about the axis: by what the walls found in a first pass are like.
+fn at_seam(equations: &Equations, scales: &[Scales; 2], bins: &[usize], posed: bool) -> Result<Solved> {
+    let solve = |equations: &Equations, bins: &[usize]| {
+        let column = |bin: &usize| equations.column_of_bin(*bin).unwrap_or(0);
+        let ask = |factor: f64| -> Vec<Asked> {
+            bins.iter().map(|bin| Asked { column: column(bin), across_mm: 0.0, factor }).collect()
+        };
+        let mut rows = vec![0.0; bins.len() * equations.terms.count()];
+        for (row, bin) in rows.chunks_exact_mut(equations.terms.count()).zip(bins) {
+            equations.terms.step_row(equations.columns.course.bin_middle(*bin), row);
+        }
+        equations.solve(scales, [&ask(-1.0), &ask(1.0)], &rows)
+    };
+    if !posed || equations.terms.shots() < 2 {
+        return solve(equations, bins);
+    }
+    let first = solve(equations, &[])?;
+    let turning = equations.terms.turning(&first.border.estimate);
+    solve(&equations.with(turning), bins)
+}

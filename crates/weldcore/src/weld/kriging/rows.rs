@@ -1,0 +1,142 @@
+//! Small dense matrices, row by row: the four operations that an elimination by blocks lives on.
+//!
+//! All of them add multiples of rows to a row, which the compiler turns into vector instructions; nothing is shared between
+//! threads, so that the order of every sum is fixed.
+
+use multiversion::multiversion;
+
+/// Rows that are taken together: each load of the sum serves so many products.
+const TOGETHER: usize = 8;
+
+/// `out += Σ coefficients[k] · rows[k]`, rows being `stride` long and read from `from` on.
+#[inline(always)]
+fn add_rows(out: &mut [f64], rows: &[f64], stride: usize, from: usize, coefficients: impl Fn(usize) -> f64) {
+    let count = rows.len() / stride;
+    let length = out.len();
+    let row = |k: usize| &rows[k * stride + from..k * stride + from + length];
+    let mut k = 0;
+    while k + TOGETHER <= count {
+        let a: [f64; TOGETHER] = std::array::from_fn(|i| coefficients(k + i));
+        let r: [&[f64]; TOGETHER] = std::array::from_fn(|i| row(k + i));
+        for j in 0..length {
+            let first = (a[0] * r[0][j] + a[1] * r[1][j]) + (a[2] * r[2][j] + a[3] * r[3][j]);
+            let second = (a[4] * r[4][j] + a[5] * r[5][j]) + (a[6] * r[6][j] + a[7] * r[7][j]);
+            out[j] += first + second;
+        }
+        k += TOGETHER;
+    }
+    while k < count {
+        let (a, r) = (coefficients(k), row(k));
+        for j in 0..length {
+            out[j] += a * r[j];
+        }
+        k += 1;
+    }
+}
+
+/// The upper triangle of `gram += ZᵀZ`; `z` has rows of `columns`.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+pub(super) fn add_gram(gram: &mut [f64], z: &[f64], columns: usize) {
+    for (i, out) in gram.chunks_exact_mut(columns).enumerate() {
+        add_rows(&mut out[i..], z, columns, i, |k| z[k * columns + i]);
+    }
+}
+
+/// `out -= WᵀZ`; W has rows of `width`, Z and `out` of `columns`.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+pub(super) fn subtract_product(out: &mut [f64], w: &[f64], width: usize, z: &[f64], columns: usize) {
+    for (i, out) in out.chunks_exact_mut(columns).enumerate() {
+        add_rows(out, z, columns, 0, |k| -w[k * width + i]);
+    }
+}
+
+/// `L⁻¹ R` in place; L is the lower factor, `size` square, R has rows of `columns`.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+pub(super) fn forward(lower: &[f64], size: usize, right: &mut [f64], columns: usize) {
+    for i in 0..size {
+        let (done, rest) = right.split_at_mut(i * columns);
+        let factors = &lower[i * size..(i + 1) * size];
+        let out = &mut rest[..columns];
+        add_rows(out, done, columns, 0, |k| -factors[k]);
+        let over = 1.0 / factors[i];
+        out.iter_mut().for_each(|v| *v *= over);
+    }
+}
+
+/// The lower Cholesky factor of a symmetric matrix, in place of its lower triangle, and the logarithm of its determinant; `None`
+/// where it is not positive definite.
+pub(super) fn cholesky(matrix: &mut [f64], size: usize) -> Option<f64> {
+    let mut log_det = 0.0;
+    for i in 0..size {
+        for j in 0..=i {
+            let (a, b) = (&matrix[i * size..i * size + j], &matrix[j * size..j * size + j]);
+            let dot = dot(a, b);
+            let value = matrix[i * size + j] - dot;
+            if i == j {
+                if !(value > 0.0 && value.is_finite()) {
+                    return None;
+                }
+                log_det += value.ln();
+                matrix[i * size + i] = value.sqrt();
+            } else {
+                matrix[i * size + j] = value / matrix[j * size + j];
+            }
+        }
+    }
+    Some(log_det)
+}
+
+/// A scalar product in four interleaved sums.
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let mut sums = [0.0; 4];
+    let (fours, rest) = (a.chunks_exact(4), a.chunks_exact(4).remainder());
+    for (x, y) in fours.zip(b.chunks_exact(4)) {
+        for k in 0..4 {
+            sums[k] += x[k] * y[k];
+        }
+    }
+    let tail: f64 = rest.iter().zip(&b[a.len() - rest.len()..]).map(|(x, y)| x * y).sum();
+    (sums[0] + sums[1]) + (sums[2] + sums[3]) + tail
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::DMatrix;
+
+    use super::*;
+
+    fn matrix(rows: usize, columns: usize, seed: u64) -> Vec<f64> {
+        let place = |k: u64| (crate::ground::random::mix(seed.wrapping_add(k)) >> 11) as f64 / (1_u64 << 53) as f64 - 0.5;
+        (0..rows * columns).map(|k| place(k as u64)).collect()
+    }
+
+    #[test]
+    fn they_are_what_a_matrix_library_says() {
+        let (rows, width, columns) = (13, 7, 21);
+        let (z, w) = (matrix(rows, columns, 1), matrix(rows, width, 2));
+        let (zm, wm) = (DMatrix::from_row_slice(rows, columns, &z), DMatrix::from_row_slice(rows, width, &w));
+        let mut gram = vec![0.0; columns * columns];
+        add_gram(&mut gram, &z, columns);
+        let expected = zm.tr_mul(&zm);
+        for i in 0..columns {
+            for j in i..columns {
+                assert!((gram[i * columns + j] - expected[(i, j)]).abs() < 1e-14);
+            }
+        }
+        let mut out = vec![0.0; width * columns];
+        subtract_product(&mut out, &w, width, &z, columns);
+        assert!((DMatrix::from_row_slice(width, columns, &out) + wm.tr_mul(&zm)).amax() < 1e-14);
+
+        let positive = zm.tr_mul(&zm) + DMatrix::identity(columns, columns);
+        let mut lower: Vec<f64> = positive.transpose().as_slice().to_vec();
+        let log_det = cholesky(&mut lower, columns).unwrap();
+        assert!((log_det - positive.determinant().ln()).abs() < 1e-10);
+        let right = matrix(columns, 5, 3);
+        let mut solved = right.clone();
+        forward(&lower, columns, &mut solved, 5);
+        let factor = positive.cholesky().unwrap().l();
+        let expected = factor.solve_lower_triangular(&DMatrix::from_row_slice(columns, 5, &right)).unwrap();
+        assert!((DMatrix::from_row_slice(columns, 5, &solved) - expected).amax() < 1e-12);
+        assert!(cholesky(&mut [1.0, 2.0, 2.0, 1.0], 2).is_none());
+    }
+}

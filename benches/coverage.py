@@ -25,9 +25,9 @@ from pathlib import Path
 
 import numpy as np
 
-TOE_MM, REACH_MM = 6.0, 62.0
+TOE_MM, REACH_MM = 6.0, 80.0
 """Where the walls begin beside the seam, and where the view ends."""
-SPACING_MM = 1.2
+SPACING_MM = 0.9
 """Of points."""
 
 
@@ -144,7 +144,8 @@ def _weld(scenario: Scenario, random: np.random.Generator):
 def run(job: tuple[int, int]) -> dict:
     """One run of a scenario."""
     import weldscan
-    from weldscan.weld import SeamCourse, SeamFrame, label_weld, measure_step
+    from weldscan._weldcore import SeamCourse, SeamFrame
+    from weldscan.weld import label_weld, measure_step
     from weldscan.simulated.scenes import surface_of
 
     weldscan.set_threads(1)
@@ -184,7 +185,7 @@ def run(job: tuple[int, int]) -> dict:
         in_base = points @ off[:3, :3].T + off[:3, 3]
         in_scanner = (in_base - base_from_scanner[:3, 3]) @ base_from_scanner[:3, :3]
         labels = np.where(across < 0, 1, 2).astype(np.uint8)
-        seam = SeamFrame(-base_from_scanner[:3, 3], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], SeamCourse.of_radius(radius))
+        seam = SeamFrame(-base_from_scanner[:3, 3], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], SeamCourse(radius))
         shots.append(label_weld(in_scanner, labels, seam, weld.thickness_mm))
         poses.append(base_from_scanner)
     began = time.perf_counter()

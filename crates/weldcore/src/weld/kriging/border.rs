@@ -107,6 +107,9 @@ impl Border {
     /// Covariance of linear functions of the unknowns, one a row; the upper triangle.
     pub fn spread(&self, rows: &[f64]) -> Vec<f64> {
         let asked = rows.len() / self.size;
+        if asked == 0 {
+            return Vec::new();
+        }
         let mut turned = vec![0.0; rows.len()];
         for (k, row) in rows.chunks_exact(self.size).enumerate() {
             row.iter().enumerate().for_each(|(p, v)| turned[p * asked + k] = *v);

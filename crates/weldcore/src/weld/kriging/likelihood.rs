@@ -1,7 +1,8 @@
 //! What the walls' unevenness and noise are like: the scales that make the cells most likely.
 //!
 //! `-2 l` of [`super::border`] and what is known of walls beforehand ([`Prior`]) are made least over the logarithms of a wall's four
-//! scales, first of each wall alone, then of each wall beside the other one: what waves on one wall alone may be a bow of the shot.
+//! scales: of each wall alone, which takes one shot, then of each wall beside the other one, for what waves on one wall alone may
+//! be a bow of the shot.
 //! The search is a simplex: the cost jumps a little where the number of shapes across changes, and no derivative sees that.
 //!
 //! Source: J. Nelder and R. Mead, Comput. J. 7 (1965) 308; the restricted likelihood as in [`super::border`].
@@ -44,17 +45,15 @@ impl Prior {
 }
 
 /// A search ends where the corners of the simplex cost the same to this: a tenth of what one standard deviation costs.
-const CLOSE: f64 = 0.1;
+const CLOSE: f64 = 0.15;
 /// Sweeps of one search.
 const MOST_SWEEPS: usize = 80;
 /// First steps of the logarithms, and of a search that begins near its end.
 const STEPS: [f64; 4] = [0.8, 0.5, 0.5, 0.4];
 const SHORT: f64 = 0.4;
-/// Rounds over both walls.
-const ROUNDS: usize = 2;
 
 /// The scales of a wall from its own cells.
-fn fit_alone(line: &Line, wall: &Wall, columns: &Columns, size: usize, prior: &Prior) -> Option<Scales> {
+pub(crate) fn fit_alone(line: &Line, wall: &Wall, columns: &Columns, size: usize, prior: &Prior) -> Option<Scales> {
     let cost = |logs: &[f64; 4]| {
         let (scales, price) = prior.read(logs);
         let reduced = sweep(line, wall, &scales, &[])?;
@@ -63,42 +62,29 @@ fn fit_alone(line: &Line, wall: &Wall, columns: &Columns, size: usize, prior: &P
     search(prior.start(), STEPS, &cost).map(|logs| prior.read(&logs).0)
 }
 
-/// The scales of both walls: each alone, on a thread of its own, unless they are about known (`near`); then in turn beside the
-/// other.
+/// The scales of both walls, each beside the other as it was begun with, on a thread of its own.
 pub(crate) fn fit(
     line: &Line,
     walls: [&Wall; 2],
     columns: [&Columns; 2],
     size: usize,
     priors: [&Prior; 2],
-    near: Option<[Scales; 2]>,
+    near: [Scales; 2],
 ) -> Option<[Scales; 2]> {
-    let mut found = match near {
-        Some(near) => near,
-        None => {
-            let alone = |k: usize| fit_alone(line, walls[k], columns[k], size, priors[k]);
-            let (first, second) = threads::install(|| rayon::join(|| alone(0), || alone(1)));
-            [first?, second?]
-        }
-    };
     let swept = |k: usize, scales: &Scales| sweep(line, walls[k], scales, &[]);
-    let mut reduced: [Reduced; 2] = [swept(0, &found[0])?, swept(1, &found[1])?];
-    for _ in 0..ROUNDS {
-        for k in 0..2 {
-            let beside = &reduced[1 - k];
-            let cost = |logs: &[f64; 4]| {
-                let (scales, price) = priors[k].read(logs);
-                let mine = swept(k, &scales)?;
-                let joined = Border::join(size, &[(&mine, columns[k]), (beside, columns[1 - k])])?;
-                Some(joined.cost + price)
-            };
-            let Scales { sd_mm, along_mm, across_mm, noise } = found[k];
-            let start = [sd_mm, along_mm, across_mm, noise].map(f64::ln);
-            found[k] = priors[k].read(&search(start, STEPS.map(|s| SHORT * s), &cost)?).0;
-            reduced[k] = swept(k, &found[k])?;
-        }
-    }
-    Some(found)
+    let begun: [Reduced; 2] = [swept(0, &near[0])?, swept(1, &near[1])?];
+    let beside = |k: usize| {
+        let cost = |logs: &[f64; 4]| {
+            let (scales, price) = priors[k].read(logs);
+            let mine = swept(k, &scales)?;
+            Some(Border::join(size, &[(&mine, columns[k]), (&begun[1 - k], columns[1 - k])])?.cost + price)
+        };
+        let Scales { sd_mm, along_mm, across_mm, noise } = near[k];
+        let start = [sd_mm, along_mm, across_mm, noise].map(f64::ln);
+        search(start, STEPS.map(|s| SHORT * s), &cost).map(|logs| priors[k].read(&logs).0)
+    };
+    let (first, second) = threads::install(|| rayon::join(|| beside(0), || beside(1)));
+    Some([first?, second?])
 }
 
 /// The least cost by a simplex of five corners; `None` where the cost has no value at the start.

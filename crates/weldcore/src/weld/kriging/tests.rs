@@ -149,6 +149,13 @@ fn dense(case: &Case) -> (f64, DVector<f64>, DMatrix<f64>) {
     (cost, h, c)
 }
 
+fn both(case: &Case, prior: &Prior) -> Option<[Scales; 2]> {
+    let alone = |k: usize| fit_alone(&case.line, &case.walls[k], &case.columns[k], case.size, prior);
+    let near = [alone(0)?, alone(1)?];
+    let (walls, columns) = ([&case.walls[0], &case.walls[1]], [&case.columns[0], &case.columns[1]]);
+    fit(&case.line, walls, columns, case.size, [prior, prior], near)
+}
+
 #[test]
 fn elimination_is_dense_kriging() {
     for closed in [false, true] {
@@ -202,9 +209,7 @@ fn the_likeliest_scales_are_those_that_walls_were_drawn_from() {
             });
         }
         let prior = Prior::of_walls([5.0, 5.0], [120.0, 40.0]);
-        let walls = [&case.walls[0], &case.walls[1]];
-        let columns = [&case.columns[0], &case.columns[1]];
-        let scales = fit(&case.line, walls, columns, case.size, [&prior, &prior], None).unwrap();
+        let scales = both(&case, &prior).unwrap();
         for (sums, s) in found.iter_mut().zip(scales) {
             let logs = [s.sd_mm, s.along_mm, s.across_mm, s.noise].map(f64::ln);
             sums.iter_mut().zip(logs).for_each(|(sum, l)| *sum += l / runs as f64);
@@ -227,8 +232,7 @@ fn the_same_bits_on_any_number_of_threads() {
     for n in [1, 2, 8] {
         threads::set_threads(Some(n)).unwrap();
         let prior = Prior::of_walls([5.0, 5.0], [120.0, 40.0]);
-        let walls = [&case.walls[0], &case.walls[1]];
-        let scales = fit(&case.line, walls, [&case.columns[0], &case.columns[1]], case.size, [&prior, &prior], None);
+        let scales = both(&case, &prior);
         let answer = by_sweeps(&case).1;
         seen.push((scales, largest(&answer.value, &answer.covariance)));
     }

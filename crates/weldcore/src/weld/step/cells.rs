@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use super::view::{LabelledShot, View, is_wall};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, require_count};
 use crate::ground::robust::median;
 use crate::ground::stop::polled;
 use crate::ground::threads;
@@ -24,6 +24,11 @@ const SHARED: [usize; 5] = [1, 3, 5, 9, 15];
 const FULL_PART: f64 = 0.25;
 /// The scatter of a cell's points is not taken to be less: no scanner is as good.
 const LEAST_SCATTER_MM: f64 = 1e-4;
+/// So many differences tell the scatter; with fewer it is taken to be usual, and the cells tell by how much that is wrong.
+const TELLING: f64 = 30.0;
+const USUAL_SCATTER_MM: f64 = 0.03;
+/// Fewer cells are no wall.
+const LEAST_CELLS: usize = 8;
 /// Two walls whose arc leaves out so much of a closed seam are an open one.
 const OPEN_GAP: f64 = 1.0 / 6.0;
 
@@ -136,6 +141,9 @@ pub(super) fn gather(shots: &[LabelledShot], views: &[View], columns: &Columns) 
             wall.cells.extend(found.cells[k].iter().map(|c| Cell { shot: index, ..*c }));
         }
     }
+    for wall in &walls {
+        require_count("cells of a wall", LEAST_CELLS, wall.cells.len())?;
+    }
     Ok(Gathered { walls, seen })
 }
 
@@ -189,7 +197,8 @@ fn of_shot(shot: &LabelledShot, view: &View, columns: &Columns, rows_mm: [f64; 2
         let mut numbers: Vec<f64> = mine.iter().map(|s| s[0]).filter(|n| *n > 0.0).collect();
         let full = FULL_PART * median(&mut numbers);
         let (square, free) = mine.iter().map(scatter).fold((0.0, 0.0), |a, b| (a.0 + b.0, a.1 + b.1));
-        let variance = if free > 0.0 { square / free } else { 0.0 }.max(LEAST_SCATTER_MM * LEAST_SCATTER_MM);
+        let scatter = if free >= TELLING { (square / free).sqrt() } else { USUAL_SCATTER_MM };
+        let variance = scatter.max(LEAST_SCATTER_MM).powi(2);
         let cell = |(at, s): (usize, &Sums)| {
             (s[0] > 0.0 && s[0] >= full).then(|| Cell {
                 column: (first + at / rows[k] * columns.of_a_cell) % columns.around,

@@ -4,7 +4,7 @@ use super::cells::{Columns, Gathered, line_of};
 use super::terms::Terms;
 use crate::error::{Error, Result};
 use crate::ground::threads;
-use crate::weld::kriging::{Answer, Asked, Border, Cell, Columns as BorderColumns, Line, Prior, Reduced, Scales, Wall, fit, sweep};
+use crate::weld::kriging::{Answer, Asked, Border, Cell, Columns as BorderColumns, Line, Prior, Reduced, Scales, Wall, fit, fit_alone, sweep};
 
 /// So many shots, that share as little of the seam as may be, tell what the walls are like: the others see the same waves.
 const SHOTS_FOR_SCALES: usize = 8;
@@ -68,8 +68,8 @@ impl Equations {
 
     /// The same with other terms of the same unknowns.
     pub fn with(&self, terms: Terms) -> Self {
-        let mut made =
-            Self { terms, border: self.border.clone(), walls: [empty(), empty()], ..*self };
+        let border = [false, true].map(|other| terms.columns(other));
+        let mut made = Self { terms, border, walls: [empty(), empty()], ..*self };
         made.walls = std::array::from_fn(|k| self.rebuilt(&made.terms, k == 1, |_| true));
         made
     }
@@ -88,13 +88,42 @@ impl Equations {
         })
     }
 
-    /// What the walls are like, begun at `near` where it is known about.
+    /// What the walls are like: begun at `near`, or with each wall alone as the shot with the most cells has it.
     pub fn scales(&self, near: Option<[Scales; 2]>) -> Result<[Scales; 2]> {
+        let undetermined = || degenerate("the walls do not determine it");
         let chosen = self.telling();
+        let size = self.terms.count();
+        let near = match near {
+            Some(near) => near,
+            None => {
+                let count = |shot: usize| self.walls.iter().flat_map(Wall::cells).filter(|c| c.shot == shot).count();
+                let most = (0..self.terms.shots()).max_by_key(|k| (count(*k), std::cmp::Reverse(*k))).unwrap_or(0);
+                let one = self.of_a_shot(most);
+                let alone =
+                    |k: usize| fit_alone(&one.line, &one.walls[k], &one.border[k], one.terms.count(), &self.priors[k]);
+                let (first, second) = threads::install(|| rayon::join(|| alone(0), || alone(1)));
+                first.zip(second).map(|(a, b)| [a, b]).ok_or_else(undetermined)?
+            }
+        };
         let part = self.only(|_, cell| chosen.contains(&cell.shot));
         let (walls, columns) = ([&part.walls[0], &part.walls[1]], [&part.border[0], &part.border[1]]);
-        let found = fit(&part.line, walls, columns, self.terms.count(), [&self.priors[0], &self.priors[1]], near);
-        found.ok_or_else(|| degenerate("the walls do not determine it"))
+        fit(&part.line, walls, columns, size, [&self.priors[0], &self.priors[1]], near).ok_or_else(undetermined)
+    }
+
+    /// One shot on a line of its own.
+    fn of_a_shot(&self, shot: usize) -> Self {
+        let around = self.columns.around;
+        let walls = self.walls.each_ref().map(|w| {
+            let mine = w.cells().iter().filter(|c| c.shot == shot);
+            let cells = mine.map(|c| Cell { column: (c.column + self.start) % around, shot: 0, ..*c }).collect();
+            super::cells::WallCells { cells, ..Default::default() }
+        });
+        let (line, start) = line_of(&self.columns, &walls);
+        let terms = self.terms.of_shot(shot);
+        let border = [false, true].map(|other| terms.columns(other));
+        let mut made = Self { line, start, terms, border, walls: [empty(), empty()], ..*self };
+        made.walls = std::array::from_fn(|k| made.wall(k == 1, &walls[k].cells, self.walls[k].rows_mm().to_vec()));
+        made
     }
 
     /// The shots that tell what the walls are like: one after the other that with the most columns not seen so far.

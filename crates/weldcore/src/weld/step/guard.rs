@@ -32,6 +32,11 @@ impl Guard {
         BAND * band_factor.clamp(BAND_FACTORS[0], BAND_FACTORS[1])
     }
 
+    /// Of walls that nothing can be said of.
+    pub fn none(bins: usize, scales: [Scales; 2]) -> Self {
+        Self { departures: vec![None; bins], scales }
+    }
+
     pub fn of(equations: &Equations, near: [Scales; 2], rows_mm: [f64; 2], reach_mm: [[f64; 2]; 2]) -> Result<Self> {
         let limits: [f64; 2] = std::array::from_fn(|k| {
             let [from, to] = reach_mm[k];
@@ -52,8 +57,16 @@ impl Guard {
             }
             found
         });
-        let pairs: Vec<(Cell, Cell)> =
-            nearest[0].iter().zip(&nearest[1]).filter_map(|(a, b)| Some(((*a)?, (*b)?))).collect();
+        // One pair a bin: the one with the most points.
+        let mut pairs: Vec<Option<(Cell, Cell)>> = vec![None; equations.columns.course.bins()];
+        for (reference, other) in nearest[0].iter().zip(&nearest[1]).filter_map(|(a, b)| Some(((*a)?, (*b)?))) {
+            let slot = &mut pairs[equations.columns.course.bin(equations.at(&other))];
+            let less = |(a, b): &(Cell, Cell)| a.weight.min(b.weight) < reference.weight.min(other.weight);
+            if slot.as_ref().is_none_or(less) {
+                *slot = Some((reference, other));
+            }
+        }
+        let pairs: Vec<(Cell, Cell)> = pairs.into_iter().flatten().collect();
         let mut departures = vec![None; equations.columns.course.bins()];
         if pairs.is_empty() {
             return Ok(Self { departures, scales });
@@ -74,11 +87,7 @@ impl Guard {
             let noise = scales[0].noise / reference.weight + scales[1].noise / other.weight;
             let sigma = (predicted.covariance[k * pairs.len() + k] + noise).sqrt();
             let z = (other.height_mm - reference.height_mm - predicted.value[k]) / sigma;
-            let bin = equations.columns.course.bin(equations.at(other));
-            let slot: &mut Option<f64> = &mut departures[bin];
-            if slot.is_none_or(|old| old.abs() < z.abs()) {
-                *slot = Some(z);
-            }
+            departures[equations.columns.course.bin(equations.at(other))] = Some(z);
         }
         Ok(Self { departures, scales })
     }

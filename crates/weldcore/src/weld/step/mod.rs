@@ -181,8 +181,10 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
     if bins.is_empty() {
         return Err(Error::NotFound { what: "step", reason: "no angle at which both walls were seen".into() });
     }
+    let bin_count = seam.course.bins();
     let near = equations.scales(None)?;
-    let guard = Guard::of(&equations, near, rows_mm, reach_mm)?;
+    // Walls too short to leave anything out are not told apart.
+    let guard = Guard::of(&equations, near, rows_mm, reach_mm).unwrap_or_else(|_| Guard::none(bin_count, near));
     let (mut scales, mut solved) = (near, at_seam(&equations, &near, &bins, posed)?);
     let mut found = largest_step(&solved.answer.value, &solved.answer.covariance);
     let departure_limit = Guard::limit(found.as_ref().map_or(0.0, |f| f.band_factor));

@@ -22,8 +22,8 @@ const MOST_WAVES: usize = 12;
 /// Terms n = 2, 3, ..., a cosine and a sine of each.
 const ROUND: usize = 2 * (MOST_WAVES - 1);
 const SHELL: usize = 5;
-/// Of a shot: radius, place (2), lean (2), turn.
-const OF_A_SHOT: usize = 6;
+/// Of a shot: radius, place (2), lean (2); and its turn, where that is solved for.
+const OF_A_SHOT: usize = 5;
 
 // Where each group of unknowns begins.
 const RADIUS: usize = 0;
@@ -108,15 +108,29 @@ impl Terms {
         self.middles.len()
     }
 
+    /// Of one of the shots alone.
+    pub fn of_shot(&self, shot: usize) -> Self {
+        Self { middles: vec![self.middles[shot]], ..self.clone() }
+    }
+
+    fn of_a_shot(&self) -> usize {
+        OF_A_SHOT + usize::from(self.turned.is_some())
+    }
+
+    /// Where the unknowns of a shot begin.
+    fn shot_at(&self, shot: usize) -> usize {
+        SHOTS + self.of_a_shot() * shot
+    }
+
     /// How many unknowns there are.
     pub fn count(&self) -> usize {
-        SHOTS + OF_A_SHOT * self.middles.len()
+        self.shot_at(self.middles.len())
     }
 
     /// Of the reference wall (`other` false) and of the other one.
     pub fn width(&self, other: bool) -> Width {
         let common = if other { STEP_ROUND + ROUND + SHELL } else { ROUND + SHELL };
-        Width { common, of_a_shot: OF_A_SHOT, shots: self.middles.len() }
+        Width { common, of_a_shot: self.of_a_shot(), shots: self.middles.len() }
     }
 
     /// Which unknowns each column of a wall is the sum of.
@@ -177,10 +191,10 @@ impl Terms {
         out[0] = radius;
         (out[1], out[2]) = (place * a, place * b);
         (out[3], out[4]) = (lean * across_mm * a, lean * across_mm * b);
-        out[5] = self.turned.as_ref().map_or(0.0, |[reference, step]| {
+        if let Some([reference, step]) = &self.turned {
             let more = if other { slope(step, at) } else { 0.0 };
-            self.course.difference(TURN_MM) * (slope(reference, at) + more)
-        });
+            out[OF_A_SHOT] = self.course.difference(TURN_MM) * (slope(reference, at) + more);
+        }
     }
 
     /// The row of the step at the seam: other wall less reference wall.
@@ -217,11 +231,11 @@ impl Terms {
     pub fn reference_height(&self, estimate: &[f64], shot: usize, at: f64, across_mm: f64) -> f64 {
         let mut round = [0.0; ROUND];
         self.round(at, &mut round);
-        let mut own = [0.0; OF_A_SHOT];
+        let mut own = [0.0; OF_A_SHOT + 1];
         self.shot(false, shot, at, across_mm, &mut own);
         let common = round.iter().zip(&estimate[REFERENCE_ROUND..]).map(|(a, b)| a * b).sum::<f64>();
-        let first = SHOTS + OF_A_SHOT * shot;
-        common + own.iter().zip(&estimate[first..]).map(|(a, b)| a * b).sum::<f64>()
+        let first = self.shot_at(shot);
+        common + own[..self.of_a_shot()].iter().zip(&estimate[first..]).map(|(a, b)| a * b).sum::<f64>()
     }
 
     /// A row that picks one unknown in its own unit.
@@ -261,7 +275,7 @@ impl Terms {
         let [_, place, _] = self.shot_sigma;
         let [a, b] = self.course.offset(self.course.apart(at, self.middles[shot]));
         let mut row = vec![0.0; self.count()];
-        let first = SHOTS + OF_A_SHOT * shot;
+        let first = self.shot_at(shot);
         (row[first + 1], row[first + 2]) = (-place * b, place * a);
         row
     }

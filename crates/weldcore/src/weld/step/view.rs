@@ -110,16 +110,27 @@ impl View {
     /// # Errors
     /// [`Error::TooFew`] without both walls, [`Error::Degenerate`] where all points lie at one place.
     pub fn of(shot: &LabelledShot, common: &Seam) -> Result<Self> {
-        let mut count = [0_usize; 2];
-        shot.walls().for_each(|(_, other)| count[usize::from(other)] += 1);
+        let (own, u) = (shot.seam.course, shot.unrolled);
+        // Any place about the middle will do to count from.
+        let some = (0..shot.labels.len()).step_by(MIDDLE_STRIDE).filter(|i| is_wall(shot.labels[*i]).is_some());
+        let own_middle = own.middle(some.map(|i| u.at[i]));
+        let walls = |range: std::ops::Range<usize>| range.filter_map(|i| Some((i, usize::from(is_wall(shot.labels[i])?))));
+        let (mut count, mut own_half, mut far) = ([0_usize; 2], 0.0_f64, 1.0_f64);
+        for (more, half, reach) in threads::map_ranges(shot.labels.len(), |range| {
+            let (mut count, mut half, mut far) = ([0_usize; 2], 0.0_f64, 1.0_f64);
+            for (i, k) in walls(range) {
+                count[k] += 1;
+                half = half.max(own.apart(f64::from(u.at[i]), own_middle).abs());
+                far = far.max(f64::from(u.across_mm[i].abs()));
+            }
+            (count, half, far)
+        }) {
+            count = [count[0] + more[0], count[1] + more[1]];
+            (own_half, far) = (own_half.max(half), far.max(reach));
+        }
         for (what, n) in [("points of the reference wall", count[0]), ("points of the other wall", count[1])] {
             require_count(what, 100, n)?;
         }
-        let own = shot.seam.course;
-        let at = |i: usize| f64::from(shot.unrolled.at[i]);
-        // Any place about the middle will do to count from.
-        let own_middle = own.middle(shot.walls().step_by(MIDDLE_STRIDE).map(|(i, _)| shot.unrolled.at[i]));
-        let own_half = shot.walls().map(|(i, _)| own.apart(at(i), own_middle).abs()).fold(0.0, f64::max);
         if own_half <= 0.0 {
             return Err(Error::Degenerate { what: "step", reason: "all points lie at one angle".into() });
         }
@@ -127,8 +138,6 @@ impl View {
             let Some(base_from_scanner) = &shot.base_from_scanner else { return [at, across, 0.0] };
             common.place(&base_from_scanner.apply(&shot.seam.point(at, across)).into())
         };
-        let far = shot.walls().map(|(i, _)| shot.unrolled.across_mm[i].abs()).fold(1.0, f32::max);
-        let far = f64::from(far);
         let entry = |k: usize| {
             let at = own_middle + own_half * (2.0 * k as f64 / TABLE as f64 - 1.0);
             let ends = [-far, far].map(|across| {
@@ -150,13 +159,20 @@ impl View {
             reach_mm: [[f64::INFINITY, 0.0]; 2],
         };
         view.middle = course.apart(own_middle + view.entry(own_middle)[0], 0.0);
-        view.half = 0.0;
-        for (i, other) in shot.walls() {
-            let [at, across, _] = view.placed(shot.unrolled, i);
-            view.half = view.half.max(course.apart(at, view.middle).abs());
-            let reach = &mut view.reach_mm[usize::from(other)];
-            *reach = [reach[0].min(across.abs()), reach[1].max(across.abs())];
-        }
+        let parts = threads::map_ranges(shot.labels.len(), |range| {
+            let (mut half, mut reach) = (0.0_f64, [[f64::INFINITY, 0.0]; 2]);
+            for (i, k) in walls(range) {
+                let [at, across, _] = view.placed(u, i);
+                half = half.max(course.apart(at, view.middle).abs());
+                reach[k] = [reach[k][0].min(across.abs()), reach[k][1].max(across.abs())];
+            }
+            (half, reach)
+        });
+        view.half = parts.iter().map(|p| p.0).fold(0.0, f64::max);
+        view.reach_mm = std::array::from_fn(|k| {
+            let all = parts.iter().map(|p| p.1[k]);
+            all.fold([f64::INFINITY, 0.0], |a, b| [a[0].min(b[0]), f64::max(a[1], b[1])])
+        });
         Ok(view)
     }
 

@@ -27,6 +27,10 @@ pub(super) struct Equations {
 pub(super) struct Solved {
     pub border: Border,
     pub answer: Answer,
+    /// Whose unknowns these are.
+    pub terms: Terms,
+    /// What they leave of every cell's height.
+    pub residuals: Vec<f64>,
 }
 
 impl Equations {
@@ -146,7 +150,7 @@ impl Equations {
     }
 
     /// What the unknowns leave of every cell's height.
-    pub fn residuals(&self, estimate: &[f64]) -> Vec<f64> {
+    fn residuals(&self, estimate: &[f64]) -> Vec<f64> {
         let of_wall = |k: usize| {
             let wall = &self.walls[k];
             let left = move |(cell, own): (&Cell, &[f64])| {
@@ -180,7 +184,8 @@ impl Equations {
         if answer.value.iter().chain(&answer.covariance).any(|v| !v.is_finite()) {
             return Err(degenerate("the fit of the walls did not converge"));
         }
-        Ok(Solved { border, answer })
+        let residuals = self.residuals(&border.estimate);
+        Ok(Solved { border, answer, terms: self.terms.clone(), residuals })
     }
 }
 

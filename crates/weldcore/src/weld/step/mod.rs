@@ -197,8 +197,7 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
     let Some(largest) = found else {
         return Err(Error::Degenerate { what: "step", reason: "its uncertainty is none".into() });
     };
-    let Solved { border, answer } = &solved;
-    let terms = &equations.terms;
+    let Solved { border, answer, terms, residuals } = &solved;
 
     let course = seam.course;
     let n = bins.len();
@@ -254,7 +253,6 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
     });
     let mean_variance = answer.covariance.iter().sum::<f64>() / (n * n) as f64;
     let of_place = profile.iter().map(|b| b.place_mm).sum::<f64>() / n as f64;
-    let left = equations.residuals(estimate);
     Ok(Step {
         mean_mm,
         median_mm,
@@ -273,8 +271,8 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
             reach_mm: [s.along_mm, s.across_mm],
             noise: s.noise,
         }),
-        residual_rms_mm: (left.iter().map(|r| r * r).sum::<f64>() / left.len() as f64).sqrt(),
-        cells: left.len(),
+        residual_rms_mm: (residuals.iter().map(|r| r * r).sum::<f64>() / residuals.len() as f64).sqrt(),
+        cells: residuals.len(),
         covariance_mm2: answer.covariance.clone(),
         departure_limit,
         profile,

@@ -28,8 +28,8 @@ INSTANT = {
     "Plane": "keeps numbers",
     "Scanner": "keeps numbers",
     "Sphere": "keeps numbers",
-    "WeldStep.column": "one of nine numbers of each bin",
-    "WeldStep.keys": "19 names",
+    "WeldStep.column": "one of eight numbers of each bin",
+    "WeldStep.keys": "24 names",
     "harmonics_of_gamma": "47 products",
     "phase_error_of_harmonics": "512 points of a curve",
     "set_threads": "sets a number",
@@ -412,6 +412,13 @@ def _(scale: float) -> Job:
 def _(scale: float) -> Job:
     shots = [ws.segment_weld(weld_shot(4 * scale), 315.0, 6.0)] * 2
     return lambda: ws.measure_step(shots)
+
+
+@job("WeldStep.largest_of")
+def _(scale: float) -> Job:
+    step = ws.measure_step([ws.segment_weld(weld_shot(4 * scale), 315.0, 6.0)])
+    bins = list(range(len(step.profile)))
+    return lambda: step.largest_of(bins)
 
 
 @job("place_shots")

@@ -296,6 +296,7 @@ SANE: dict[str, Callable[[Random], Arguments]] = {
     "SimulatedShot.capture": lambda r: {"self": shot(), "picture": r.integers(0, 256, (12, 16), np.uint8)},
     "Sphere": lambda r: {"center_mm": r.normal(size=3), "radius_mm": r.random() * 50},
     "WeldStep.column": lambda r: {"self": weld_step(), "name": ["step_mm", "angle_deg"][r.integers(2)]},
+    "WeldStep.largest_of": lambda r: {"self": weld_step(), "bins": r.integers(0, 20, few(r)).tolist()},
     "WeldStep.keys": lambda r: {"self": weld_step()},
     "calibrate_reference_plane": reference,
     "decode": decoding,

@@ -4,6 +4,7 @@ from weldscan._later import later
 from weldscan._weldcore import (
     WeldShot,
     WeldStep,
+    label_weld,
     measure_step,
     place_shots,
     seam_fates,
@@ -38,6 +39,7 @@ __all__ = [
     "WeldStep",
     "inspect",
     "judge",
+    "label_weld",
     "limit_mm",
     "measure_step",
     "norm_ids",

@@ -15,6 +15,7 @@ STEP = {
     "axis_offset_standard_mm": 0.05,
     "tilt_rad": math.radians(0.1),
     "tilt_standard_rad": math.radians(0.02),
+    "waves_mm": [],
 }
 
 
@@ -36,7 +37,7 @@ def test_what_is_determined_has_its_uncertainty():
 def test_what_once_stood_under_a_green_pass_is_not_observable():
     # -58.8 +- 136.8 mm of diameter and 29.7 mm of offset, of a short arc.
     arc = {"radius_difference_mm": (-29.4, 34.2), "axis_offset_mm": [29.7, 0.0], "tilt_rad": 0.0}
-    unstated = {"axis_offset_standard_mm": math.nan, "tilt_standard_rad": math.inf}
+    unstated = {"axis_offset_standard_mm": math.nan, "tilt_standard_rad": math.inf, "waves_mm": []}
     found = seam_terms(SimpleNamespace(**arc, **unstated), 630.0, 6.0)
     assert found.harmonics_mm == {} and found.angle_deg is found.angle_u_deg is None
     assert found.not_observable == ("diameter_difference", "axis_offset", "angle_between_walls")
@@ -58,3 +59,20 @@ def test_half_of_what_pipes_differ_by_is_the_bound(field, name, at_most):
 
     assert missing(0.0) == missing(0.999 * at_most) == ()
     assert missing(1.001 * at_most) == missing(math.inf) == missing(math.nan) == (name,)
+
+
+def test_waves_around_the_seam_are_a_cosine_and_a_sine_where_the_scan_tells_them():
+    waves = [
+        (2, 0.3, -0.2, 0.004, 0.004, 0.5),
+        # Not told on an arc.
+        (3, 0.01, 0.01, 0.2, 0.2, 0.22),
+        # Told, and nothing.
+        (4, 0.001, 0.0, 0.003, 0.003, 0.12),
+        (7, 0.05, 0.0, 0.003, 0.003, 0.04),
+        (8, 0.001, 0.0, 0.003, 0.003, 0.03),
+    ]
+    found = seam_terms(SimpleNamespace(**{**STEP, "waves_mm": waves}), 219.1, 8.0)
+    told = {name: value for name, value in found.harmonics_mm.items() if name.startswith("n")}
+    assert set(told) == {f"n{n}_{part}{u}" for n in (2, 4, 7) for part in ("cos", "sin") for u in ("", "_u")}
+    assert (told["n2_cos"], told["n2_sin"], told["n2_sin_u"]) == (0.3, -0.2, 0.008)
+    assert found.not_observable == ("n3",)

@@ -232,7 +232,8 @@ class _Run:
             turn = float(np.linalg.eigvalsh(hand_eye.covariance[:3, :3]).max())
             angle_sigma = float(np.sqrt(max(turn, 0.0) + pose_sigma(hand_eye)[1] ** 2))
         try:
-            step = measure_step([view.shot for view in views], angle_sigma_rad=angle_sigma)
+            poses = [view.base_from_scanner for view in views] if self.session.has_robot else None
+            step = measure_step([view.shot for view in views], angle_sigma_rad=angle_sigma, base_from_scanner=poses)
         except GeometryError as error:
             return _Measured(), noticed + Journal(left_out=tuple((view.name, str(error)) for view in views))
         edges = edge_profile(views)
@@ -309,19 +310,21 @@ class _Run:
         step, cloud, seam = measured.step, measured.cloud, measured.seam
         findings = [*noticed.findings, *copies({shot.name: shot.digest for shot in noticed.shots})]
         findings += not_used(self.session, noticed.left_out, findings)
-        value, expanded, coverage = None, None, None
+        value, expanded, coverage, quantiles = None, None, None, None
         if step is not None:
             if step.histogram is not None:
                 u_mm = self.paper_uncertainty_mm(step, cloud, hand_eye)
                 step = replace(step, histogram=replace(step.histogram, expanded_uncertainty_mm=u_mm))
             value, expanded, coverage = step.max_abs_mm, step.expanded_uncertainty_mm, step.coverage_deg
+            quantiles = None if step.quantiles_mm is None else step.quantiles_mm.tolist()
             if self.method == "paper":
                 value = None if step.histogram is None else step.histogram.step_mm
                 expanded = None if step.histogram is None else step.histogram.expanded_uncertainty_mm
+                quantiles = None
         part = self.part.model_dump()
         reason = "; ".join(f"{name}: {why}" for name, why in noticed.left_out) or "method paper gave no answer"
         if not self.standing.relied_on:
-            value, expanded = None, None
+            value, expanded, quantiles = None, None, None
             reason = f"the scanner is not verified: {self.standing.text}"
         # Whatever finds something stands before the verdict: a bar found later would not count.
         scanner, said = self.scanner_record()
@@ -346,6 +349,7 @@ class _Run:
                 coverage_deg=coverage,
                 required_coverage_deg=self.required_deg,
                 bars=[*common, *doubts[norm]],
+                quantiles_mm=quantiles,
             )
         ]
         timing = dict(noticed.timing_s)
@@ -511,15 +515,9 @@ def _set_record(error: SetPhaseError) -> dict[str, Any]:
 
 
 BUDGET = (
-    ("fit_mm", "noise, extrapolation", "residuals of the walls with their correlation, propagated to the seam"),
-    ("toe_mm", "strip beside the weld", "change of the step when the half bead's width nearest to it is left out"),
-    ("local_mm", "local departure", "scatter of a bin that departs from the smooth walls"),
-    ("angle_mm", "angle", "hand-eye and robot rotation times the slope of the profile"),
-    (
-        "unevenness_mm",
-        "unevenness at the seam",
-        "the walls' correlated unevenness, which the seam need not share",
-    ),
+    ("fit_mm", "noise, terms", "noise, and the terms that walls and shots share, extrapolated to the seam"),
+    ("unevenness_mm", "unevenness at the seam", "the walls' unevenness, as far as their cells do not tell it at the seam"),
+    ("angle_mm", "angle", "hand-eye and robot rotation, and the axis on a short arc, times the slope of the profile"),
 )
 
 
@@ -536,20 +534,27 @@ def _step_result(step: WeldStep, edges: EdgeProfile, part: PartSpec) -> StepResu
     edge, edge_u = edges.step_mm[bins], edges.u_mm[bins]
     budget: tuple[BudgetLine, ...] = ()
     value, u, at = math.nan, math.nan, math.nan
+    quantiles: Floats | None = None
+    seam_mean: tuple[float, float] | None = None
     judged: Literal["wall", "edge"] = "wall"
+    band = wall_u
     if len(bins):
+        value, u, quantiles, band_factor = step.largest_of(np.flatnonzero(read).tolist())
         worst = int(np.argmax(np.abs(wall)))
-        value, u, at = abs(float(wall[worst])), float(wall_u[worst]), float(column("angle_deg")[worst])
-        budget = tuple(BudgetLine(name, float(column(key)[worst]), derived) for key, name, derived in BUDGET)
-        # The walls' own largest upper bound may stand in another bin than their largest step.
+        at, band = float(column("angle_deg")[worst]), band_factor * column("standard_mm")
+        seam_mean = (step.seam_mean_mm[0], 2 * step.seam_mean_mm[1])
+        budget = _budget({key: float(column(key)[worst]) for key, _, _ in BUDGET}, u / 2, len(bins))
+        # Where the walls do not run on to the weld as they run further away, they cannot tell what it hides.
+        departs = bool((np.abs(np.nan_to_num(column("departure"))) > step.departure_limit).any())
         upper = max(value + u, float((np.abs(wall) + wall_u).max()))
         if (
             edges.judged is not None
             and edges.worst is not None
             and sum(edges.judged) > upper
-            and (edges.confirmed_mm > upper or edges.disturbed or edges.contradict(bins, wall, wall_u))
+            and (edges.confirmed_mm > upper or edges.disturbed or departs or edges.contradict(bins, wall, wall_u))
         ):
             (value, u), at, judged = edges.judged, edges.course.bin_width * edges.worst, "edge"
+            quantiles, band = None, band_factor / 2 * edge_u
             derived = "reading beside both toes: noise, choice of the stretch, and what the choice of the toes may hide"
             budget = (BudgetLine("edges", u / 2, derived),)
     terms = seam_terms(step, part.outside_diameter, part.wall_thickness)
@@ -575,4 +580,16 @@ def _step_result(step: WeldStep, edges: EdgeProfile, part: PartSpec) -> StepResu
         wall_u_mm=wall_u,
         edge_step_mm=edge,
         edge_u_mm=edge_u,
+        band_mm=band,
+        quantiles_mm=quantiles,
+        seam_mean=seam_mean,
     )
+
+
+def _budget(parts: dict[str, float], combined_mm: float, bins: int) -> tuple[BudgetLine, ...]:
+    """The contributions at the largest step; what many bins that vie for it add comes from the draws."""
+    lines = [BudgetLine(name, parts[key], derived) for key, name, derived in BUDGET]
+    more = combined_mm**2 - sum(part**2 for part in parts.values())
+    if more > 0:
+        lines.append(BudgetLine("largest of many", math.sqrt(more), f"draws of all {bins} bins together (JCGM 101)"))
+    return tuple(lines)

@@ -16,6 +16,10 @@ DIAMETER_PRIOR = 0.01
 """Of the difference of two diameters, as a share of them: the usual delivery tolerance, 1 % (EN 10216)."""
 OFFSET_PRIOR = 1.0
 """Of the axes' offset, in wall thicknesses: beyond it the walls no longer meet."""
+NAMED_WAVES = 4
+"""Terms of the step around the seam that are named whether or not the scan tells them: oval, three- and four-lobed."""
+TOLD = 3.0
+"""Further ones are named where an amplitude is so many standard uncertainties."""
 ANGLE_PRIOR_DEG = math.degrees(1.5 / 200)
 """Of the angle between the axes: 1.5 mm over 200 mm of pipe, what a fitted joint may be bent by."""
 
@@ -33,6 +37,8 @@ class FittedTerms(Protocol):
     def tilt_rad(self) -> float: ...
     @property
     def tilt_standard_rad(self) -> float: ...
+    @property
+    def waves_mm(self) -> list[tuple[int, float, float, float, float, float]]: ...
 
 
 @dataclass(frozen=True)
@@ -40,7 +46,7 @@ class SeamTerms:
     """The terms that a scan determines, and the names of those that it does not."""
 
     harmonics_mm: dict[str, float]
-    """`name`, `name_u` (expanded, k = 2), `name_at_deg`."""
+    """`name`, `name_u` (expanded, k = 2), `name_at_deg`; of n waves around the seam `n2_cos`, `n2_sin` and so on."""
     angle_deg: float | None
     angle_u_deg: float | None
     not_observable: tuple[str, ...]
@@ -51,7 +57,8 @@ def seam_terms(step: FittedTerms, outside_diameter_mm: float, wall_mm: float) ->
 
     Args:
         step: what `measure_step` returned: radius difference with its standard uncertainty, axis offset and angle, with
-            theirs along their own direction; infinite or NaN where it has none.
+            theirs along their own direction; infinite or NaN where it has none. And the step's waves around the seam, each
+            as (n, cosine, sine, their standard uncertainties, their prior's).
         outside_diameter_mm: rated.
         wall_mm: rated thickness of the wall.
 
@@ -60,7 +67,7 @@ def seam_terms(step: FittedTerms, outside_diameter_mm: float, wall_mm: float) ->
         >>> from weldscan.measure.observable_terms import seam_terms
         >>> step = SimpleNamespace(
         ...     radius_difference_mm=(-29.4, 34.2), axis_offset_mm=[29.0, 6.0], axis_offset_standard_mm=14.0,
-        ...     tilt_rad=0.001, tilt_standard_rad=0.02,
+        ...     tilt_rad=0.001, tilt_standard_rad=0.02, waves_mm=[],
         ... )
         >>> seam_terms(step, 630.0, 6.0).not_observable
         ('diameter_difference', 'axis_offset', 'angle_between_walls')
@@ -80,6 +87,14 @@ def seam_terms(step: FittedTerms, outside_diameter_mm: float, wall_mm: float) ->
         harmonics |= {"axis_offset": math.hypot(east, north), "axis_offset_u": u, "axis_offset_at_deg": at}
     else:
         missing.append("axis_offset")
+    for n, cosine, sine, *standard, prior in step.waves_mm:
+        amplitudes = {"cos": (cosine, standard[0]), "sin": (sine, standard[1])}
+        told = [abs(a) > TOLD * u for a, u in amplitudes.values()]
+        if not all(_determined(_expanded(u), prior) for u in standard):
+            missing += [f"n{n}"] if n <= NAMED_WAVES else []
+        elif n <= NAMED_WAVES or any(told):
+            for name, (amplitude, u) in amplitudes.items():
+                harmonics |= {f"n{n}_{name}": amplitude, f"n{n}_{name}_u": _expanded(u)}
     u = math.degrees(_expanded(step.tilt_standard_rad))
     if _determined(u, ANGLE_PRIOR_DEG):
         return SeamTerms(harmonics, math.degrees(step.tilt_rad), u, tuple(missing))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
@@ -27,6 +27,8 @@ EVIDENCE = {
 MM = {"mm": Fraction(1), "in": Fraction(254, 10)}
 # How many bars a verdict's reason names; the result lists them all.
 NAMED_BARS = 2
+# Of a distribution: 0, 1, ... 100 %.
+QUANTILES = 101
 
 
 @dataclass(frozen=True)
@@ -190,10 +192,12 @@ def judge(
     required_coverage_deg: float | None = None,
     guard_factor: float = 1.0,
     bars: Iterable[Finding] = (),
+    quantiles_mm: Sequence[float] | None = None,
 ) -> tuple[Judgement, ...]:
     """The verdict of one norm on a measured step, by the decision rule of ISO 14253-1.
 
     With the guard band g = `guard_factor` x U: PASS where |h| <= L - g, FAIL where |h| > L + g, INCONCLUSIVE between.
+    With the distribution of |h| (`quantiles_mm`): PASS where q95 <= L, FAIL where q05 > L (JCGM 106).
     What lies outside the norm's scope is NOT ASSESSABLE; what has no value is NOT MEASURED; a value without an
     uncertainty never passes. Too little of the seam, or a finding that bars, turns PASS into INCONCLUSIVE and leaves
     every other verdict as it is.
@@ -209,6 +213,8 @@ def judge(
         required_coverage_deg: a seam of which less was seen does not pass (it can still fail).
         guard_factor: 1 is the rule's default.
         bars: findings of the inspection; those of severity `bar` count, the others change nothing.
+        quantiles_mm: (101,) of |h|, 0, 1, ... 100 %, where its distribution is known; it decides then, and value and
+            uncertainty are shown.
 
     Returns:
         One judgement; its `barred_by` says what kept the number from being a PASS.
@@ -225,6 +231,9 @@ def judge(
     """
     norm, level = load_norm(norm_id)
     value = _finite(value_mm)
+    quantiles = () if quantiles_mm is None or value is None else tuple(float(q) for q in quantiles_mm)
+    if quantiles and (len(quantiles) != QUANTILES or not all(map(math.isfinite, quantiles))):
+        raise InputError(f"quantiles_mm: {QUANTILES} finite numbers are needed, 0, 1, ... 100 %")
     uncertainty = _finite(expanded_uncertainty_mm)
     clause_id = norm.joints.get(str(part.get("joint", "")))
     clause = norm.clauses[clause_id] if clause_id is not None else None
@@ -234,7 +243,11 @@ def judge(
         "unit": norm.unit,
         "quantity": norm.quantity,
         "note": " ".join(note for note in (norm.note, clause.note if clause else "") if note),
-        "decision_rule": f"ISO 14253-1, guard band {guard_factor:g} U, U with k = 2",
+        "decision_rule": (
+            "JCGM 106, the 5 % and 95 % quantiles of the largest step"
+            if quantiles
+            else f"ISO 14253-1, guard band {guard_factor:g} U, U with k = 2"
+        ),
     }
     if level is not None:
         details["level"] = level
@@ -258,6 +271,7 @@ def judge(
                 reason=reason,
                 details=details,
                 barred_by=barred_by,
+                quantiles_mm=quantiles,
             ),
         )
 
@@ -291,13 +305,13 @@ def judge(
         if coverage_deg is None or coverage_deg >= 360
         else f", in the {coverage_deg:.0f}° of the seam that were seen"
     )
-    low = _exact(limit) - _exact(guard_factor) * _exact(uncertainty)
-    high = _exact(limit) + _exact(guard_factor) * _exact(uncertainty)
-    step = abs(_exact(value))
-    about = f"{abs(value):.3f} mm ± {uncertainty:.3f} mm (k = 2) against {limit:.3f} mm"
-    if step > high:
+    guard, step = _exact(guard_factor) * _exact(uncertainty), abs(_exact(value))
+    below_by, above_by = (_exact(quantiles[5]), _exact(quantiles[95])) if quantiles else (step - guard, step + guard)
+    how = "95 %" if quantiles else "k = 2"
+    about = f"{abs(value):.3f} mm ± {uncertainty:.3f} mm ({how}) against {limit:.3f} mm"
+    if below_by > _exact(limit):
         return verdict(Verdict.FAIL, f"{about}: above the limit by more than the guard band{seen}")
-    if step > low:
+    if above_by > _exact(limit):
         return verdict(Verdict.INCONCLUSIVE, f"{about}: nearer to the limit than the guard band{seen}")
     below = f"{about}: below the limit by at least the guard band{seen}"
     barred = _barred(bars, coverage_deg, required_coverage_deg)

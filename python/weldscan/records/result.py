@@ -136,6 +136,8 @@ def _step(step: StepResult | None) -> dict[str, Any]:
         "max_abs": step.max_abs_mm,
         "max_abs_at_deg": step.max_abs_at_deg,
         "expanded_uncertainty": step.expanded_uncertainty_mm,
+        "q05": step.q05_mm,
+        "q95": step.q95_mm,
         "judged": step.judged,
         "histogram": histogram.step_mm if histogram else None,
         "histogram_u": histogram.expanded_uncertainty_mm if histogram else None,
@@ -143,13 +145,15 @@ def _step(step: StepResult | None) -> dict[str, Any]:
         "harmonics": step.harmonics_mm,
         "not_observable": step.not_observable,
     }
+    if step.quantiles_mm is not None:
+        document["quantiles"] = step.quantiles_mm.tolist()
     if step.angle_between_walls_deg is not None:
         document["angle_between_walls_deg"] = step.angle_between_walls_deg
         document["angle_between_walls_u_deg"] = step.angle_between_walls_u_deg
     return document
 
 
-BOTH_STEPS = ("wall_step_mm", "wall_u_mm", "edge_step_mm", "edge_u_mm")
+BOTH_STEPS = ("band_mm", "wall_step_mm", "wall_u_mm", "edge_step_mm", "edge_u_mm")
 
 
 def profile(step: StepResult | None, part: Mapping[str, Any]) -> list[dict[str, float]]:

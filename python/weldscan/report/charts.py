@@ -285,6 +285,12 @@ def _draw_step(
         side, anchor = (WIDTH - RIGHT - 8, "end") if right else (LEFT + 8, "start")
         svg.text(side, y(at) - 5, each.label, "limit-label", anchor)
 
+    if step.band_mm is not None:
+        for run in _runs(along, reading.tolist(), value.tolist(), step.band_mm[some].tolist()):
+            if len(run) > 1:
+                for side in (1, -1):
+                    edge = [(x, y(min(max(v + side * half, low), high))) for x, v, half in run]
+                    svg.path(edge, "band-of-all")
     for run in _runs(along, reading.tolist(), value.tolist(), u.tolist()):
         if len(run) == 1:
             x, v, half = run[0]

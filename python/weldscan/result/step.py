@@ -41,7 +41,7 @@ class StepResult:
     max_abs_mm: float
     max_abs_at_deg: float
     expanded_uncertainty_mm: float
-    """Of `max_abs_mm`, k = 2."""
+    """Of `max_abs_mm`: the larger half of its 95 % interval."""
     histogram: Histogram | None
     angle_deg: Floats
     """Centres of the profile's bins: even degrees about the axis from the zero mark, those that were seen."""
@@ -77,12 +77,33 @@ class StepResult:
         """Which bins of the profile hold a number with its uncertainty; the others are no measurement."""
         return np.isfinite(self.step_mm) & np.isfinite(self.u_mm)
 
+    band_mm: Floats | None = None
+    """Half width of the band that holds all bins at once in 95 % of all cases."""
+    quantiles_mm: Floats | None = None
+    """(101,): of the largest |step|, 0, 1, ... 100 %; None where only its interval is known."""
+    seam_mean: tuple[float, float] | None = None
+    """Mean step at the seam over the bins seen, and its expanded uncertainty, k = 2."""
+
     @property
     def seam_mean_mm(self) -> float | None:
-        """Mean step at the seam over the bins measured; None where there are none."""
-        return float(self.step_mm[self.measured].mean()) if self.measured.any() else None
+        """Mean step at the seam over the bins seen; None where it was not measured."""
+        return None if self.seam_mean is None else self.seam_mean[0]
 
     @property
     def seam_mean_u_mm(self) -> float | None:
-        """Its expanded uncertainty, k = 2: the mean of the bins' own, as if they shared all of it; it is not more."""
-        return float(self.u_mm[self.measured].mean()) if self.measured.any() else None
+        """Its expanded uncertainty, k = 2."""
+        return None if self.seam_mean is None else self.seam_mean[1]
+
+    @property
+    def q05_mm(self) -> float:
+        """The largest |step| is above this in 95 % of all cases."""
+        if self.quantiles_mm is None:
+            return max(self.max_abs_mm - self.expanded_uncertainty_mm, 0.0)
+        return float(self.quantiles_mm[5])
+
+    @property
+    def q95_mm(self) -> float:
+        """The largest |step| is below this in 95 % of all cases."""
+        if self.quantiles_mm is None:
+            return self.max_abs_mm + self.expanded_uncertainty_mm
+        return float(self.quantiles_mm[95])

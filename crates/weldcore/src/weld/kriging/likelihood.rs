@@ -44,8 +44,8 @@ impl Prior {
     }
 }
 
-/// A search ends where the corners of the simplex cost the same to this: a tenth of what one standard deviation costs.
-const CLOSE: f64 = 0.15;
+/// A search ends where the corners of the simplex cost the same to this: a third of what one standard deviation costs.
+const CLOSE: f64 = 0.3;
 /// Sweeps of one search.
 const MOST_SWEEPS: usize = 80;
 /// First steps of the logarithms, and of a search that begins near its end.

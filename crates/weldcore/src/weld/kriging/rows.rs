@@ -63,14 +63,40 @@ pub(super) fn forward(lower: &[f64], size: usize, right: &mut [f64], columns: us
     }
 }
 
+/// A cell's part in a block's equations: `own += w a aᵀ` (lower triangle, `size` wide, a's place being `first`), and `right += w a x`
+/// for the parts of x that are not zero, each with where it begins, and for the cell's height.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+#[allow(clippy::too_many_arguments)]
+pub(super) fn add_cell(
+    own: &mut [f64],
+    (size, first): (usize, usize),
+    right: &mut [f64],
+    columns: usize,
+    row: &[f64],
+    weight: f64,
+    parts: &[(usize, &[f64]); 2],
+    (height_at, height): (usize, f64),
+) {
+    for (a, value) in row.iter().enumerate() {
+        let scaled = weight * value;
+        let out = &mut own[(first + a) * size + first..][..=a];
+        out.iter_mut().zip(row).for_each(|(o, v)| *o += scaled * v);
+        let out = &mut right[(first + a) * columns..][..columns];
+        for (at, part) in parts {
+            out[*at..].iter_mut().zip(*part).for_each(|(o, v)| *o += scaled * v);
+        }
+        out[height_at] += scaled * height;
+    }
+}
+
 /// The lower Cholesky factor of a symmetric matrix, in place of its lower triangle, and the logarithm of its determinant; `None`
 /// where it is not positive definite.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
 pub(super) fn cholesky(matrix: &mut [f64], size: usize) -> Option<f64> {
     let mut log_det = 0.0;
     for i in 0..size {
         for j in 0..=i {
-            let (a, b) = (&matrix[i * size..i * size + j], &matrix[j * size..j * size + j]);
-            let dot = dot(a, b);
+            let dot = dot(&matrix[i * size..i * size + j], &matrix[j * size..j * size + j]);
             let value = matrix[i * size + j] - dot;
             if i == j {
                 if !(value > 0.0 && value.is_finite()) {
@@ -87,6 +113,7 @@ pub(super) fn cholesky(matrix: &mut [f64], size: usize) -> Option<f64> {
 }
 
 /// A scalar product in four interleaved sums.
+#[inline(always)]
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     let mut sums = [0.0; 4];
     let (fours, rest) = (a.chunks_exact(4), a.chunks_exact(4).remainder());

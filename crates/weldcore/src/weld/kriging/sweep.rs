@@ -9,7 +9,7 @@
 
 use super::basis::Basis;
 use super::chain::{Chain, Two, correlation, transposed};
-use super::rows::{add_gram, cholesky, forward, subtract_product};
+use super::rows::{add_cell, add_gram, cholesky, forward, subtract_product};
 use super::wall::{Asked, Line, Scales, Wall};
 use crate::ground::stop::poll;
 
@@ -43,56 +43,56 @@ pub(crate) fn sweep(line: &Line, wall: &Wall, scales: &Scales, asked: &[Asked]) 
     asked.iter().enumerate().for_each(|(k, a)| asked_in[a.column].push(k));
 
     let mut gram = vec![0.0; columns * columns];
-    let mut before: Option<(Vec<f64>, Vec<f64>)> = None;
+    let mut before: Option<Carried> = None;
+    let mut live = Live { slot: vec![usize::MAX; columns], peak: vec![0.0; columns], listed: Vec::new() };
     let mut shapes = vec![0.0; rank];
     let mut row = vec![0.0; 2 * rank];
     let mut log_det = -log_det_of_chain(line, &chain)? * rank as f64;
     for block in line.blocks() {
         poll();
         let size = 2 * rank * block.len();
+        let cells_of = |column: usize| starts[column]..starts[column + 1];
+        let shots = block.iter().flat_map(|c| wall.cells[cells_of(*c)].iter().map(|cell| cell.shot));
+        let of_shots = shots.flat_map(|k| wall.width.of_shot(k)..wall.width.of_shot(k + 1));
+        let of_asked = block.iter().flat_map(|c| asked_in[*c].iter().map(|k| border + 1 + k));
+        let carried = before.as_ref().map_or(&[][..], |b| &b.listed);
+        live.list((0..wall.width.common).chain([border]).chain(of_shots).chain(of_asked).chain(carried.iter().copied()));
+        let wide = live.listed.len();
         let mut own = vec![0.0; size * size];
-        let mut right = vec![0.0; size * columns];
+        let mut right = vec![0.0; size * wide];
         for (k, &column) in block.iter().enumerate() {
             let first = 2 * rank * k;
             spread(&mut own, size, first, first, rank, &line.own(&chain, column));
-            for (i, cell) in wall.cells[starts[column]..starts[column + 1]].iter().enumerate() {
+            for i in cells_of(column) {
+                let cell = &wall.cells[i];
                 basis.at(cell.across_mm, &mut shapes);
                 let slope = chain.rate * cell.along_mm;
                 for m in 0..rank {
                     (row[m], row[rank + m]) = (shapes[m], slope * shapes[m]);
                 }
-                let weight = cell.weight * over;
-                let at = (starts[column] + i) * held;
-                let (common, mine) = wall.rows[at..at + held].split_at(wall.width.common);
-                let mine_at = wall.width.of_shot(cell.shot);
-                for (a, value) in row.iter().enumerate() {
-                    let scaled = weight * value;
-                    let out = &mut own[(first + a) * size + first..][..=a];
-                    out.iter_mut().zip(&row).for_each(|(o, v)| *o += scaled * v);
-                    let out = &mut right[(first + a) * columns..][..columns];
-                    out.iter_mut().zip(common).for_each(|(o, v)| *o += scaled * v);
-                    out[mine_at..].iter_mut().zip(mine).for_each(|(o, v)| *o += scaled * v);
-                    out[border] += scaled * cell.height_mm;
-                }
+                let (common, mine) = wall.rows[i * held..(i + 1) * held].split_at(wall.width.common);
+                let parts = [(0, common), (live.slot[wall.width.of_shot(cell.shot).min(border)], mine)];
+                let height = (live.slot[border], cell.height_mm);
+                add_cell(&mut own, (size, first), &mut right, wide, &row, cell.weight * over, &parts, height);
             }
             for &a in &asked_in[column] {
                 basis.at(asked[a].across_mm, &mut shapes);
                 for m in 0..rank {
-                    right[(first + m) * columns + border + 1 + a] += asked[a].factor * shapes[m];
+                    right[(first + m) * wide + live.slot[border + 1 + a]] += asked[a].factor * shapes[m];
                 }
             }
         }
         couple_within(&mut own, &block, rank, &chain);
-        if let Some((carry, carried)) = &before {
-            subtract_product(&mut own, carry, size, carry, size);
-            subtract_product(&mut right, carry, size, carried, columns);
+        if let Some(before) = &before {
+            subtract_product(&mut own, &before.links, size, &before.links, size);
+            subtract_product(&mut right, &before.links, size, &live.laid_out(before, size), wide);
         }
         log_det += cholesky(&mut own, size)?;
-        let mut carry = couple_to_next(line, rank, &chain);
-        forward(&own, size, &mut carry, size);
-        forward(&own, size, &mut right, columns);
-        add_gram(&mut gram, &right, columns);
-        before = Some((carry, right));
+        let mut links = couple_to_next(line, rank, &chain);
+        forward(&own, size, &mut links, size);
+        forward(&own, size, &mut right, wide);
+        live.add_to(&mut gram, columns, &right);
+        before = Some(live.carried(links, &right, wall.width.common, border));
     }
 
     let at = |i: usize, j: usize| gram[i.min(j) * columns + i.max(j)];
@@ -124,6 +124,81 @@ pub(crate) fn sweep(line: &Line, wall: &Wall, scales: &Scales, asked: &[Asked]) 
         slope: (0..asked.len()).flat_map(|k| (0..border).map(move |j| at(border + 1 + k, j))).collect(),
         covariance,
     })
+}
+
+/// A column of the right-hand side that has fallen to this share of its largest is over: what is known of a place is soon nothing
+/// to places further on, which makes the work grow with the columns that live at once, not with all of them.
+const OVER: f64 = 1e-8;
+
+/// What a block hands on: its links to the next one, and its solved right-hand sides with the columns that they are of.
+struct Carried {
+    links: Vec<f64>,
+    right: Vec<f64>,
+    listed: Vec<usize>,
+}
+
+/// The columns of the right-hand sides that are not zero in a block.
+struct Live {
+    /// Where each column stands among them.
+    slot: Vec<usize>,
+    /// The largest that each has been.
+    peak: Vec<f64>,
+    /// In rising order.
+    listed: Vec<usize>,
+}
+
+impl Live {
+    fn list(&mut self, columns: impl Iterator<Item = usize>) {
+        self.listed.drain(..).for_each(|c| self.slot[c] = usize::MAX);
+        for c in columns {
+            if self.slot[c] == usize::MAX {
+                self.slot[c] = 0;
+                self.listed.push(c);
+            }
+        }
+        self.listed.sort_unstable();
+        self.listed.iter().enumerate().for_each(|(k, c)| self.slot[*c] = k);
+    }
+
+    /// What was handed on, in the order of the columns of this block.
+    fn laid_out(&self, before: &Carried, rows: usize) -> Vec<f64> {
+        let (from, to) = (before.listed.len(), self.listed.len());
+        let mut out = vec![0.0; rows * to];
+        for (line, given) in out.chunks_exact_mut(to).zip(before.right.chunks_exact(from)) {
+            before.listed.iter().zip(given).for_each(|(c, v)| line[self.slot[*c]] = *v);
+        }
+        out
+    }
+
+    fn add_to(&self, gram: &mut [f64], columns: usize, right: &[f64]) {
+        let wide = self.listed.len();
+        let mut own = vec![0.0; wide * wide];
+        add_gram(&mut own, right, wide);
+        for (i, &p) in self.listed.iter().enumerate() {
+            let line = &mut gram[p * columns..(p + 1) * columns];
+            self.listed[i..].iter().zip(&own[i * wide + i..]).for_each(|(q, v)| line[*q] += v);
+        }
+    }
+
+    /// Hands on what is not over; the common columns never are.
+    fn carried(&mut self, links: Vec<f64>, right: &[f64], common: usize, height: usize) -> Carried {
+        let wide = self.listed.len();
+        let mut size = vec![0.0; wide];
+        for line in right.chunks_exact(wide) {
+            size.iter_mut().zip(line).for_each(|(s, v)| *s += v * v);
+        }
+        for (c, s) in self.listed.iter().zip(&size) {
+            self.peak[*c] = self.peak[*c].max(*s);
+        }
+        let lives = |k: &usize| {
+            let c = self.listed[*k];
+            c < common || c == height || size[*k] > OVER * OVER * self.peak[c]
+        };
+        let kept: Vec<usize> = (0..wide).filter(lives).collect();
+        let listed = kept.iter().map(|k| self.listed[*k]).collect();
+        let right = right.chunks_exact(wide).flat_map(|line| kept.iter().map(|k| line[*k])).collect();
+        Carried { links, right, listed }
+    }
 }
 
 /// Adds a 2x2 matrix to the blocks of a column's states: the same for every shape.

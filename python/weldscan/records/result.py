@@ -153,7 +153,7 @@ def _step(step: StepResult | None) -> dict[str, Any]:
     return document
 
 
-BOTH_STEPS = ("band_mm", "wall_step_mm", "wall_u_mm", "edge_step_mm", "edge_u_mm")
+BOTH_STEPS = ("wall_step_mm", "wall_u_mm", "edge_step_mm", "edge_u_mm")
 
 
 def profile(step: StepResult | None, part: Mapping[str, Any]) -> list[dict[str, float]]:
@@ -161,7 +161,7 @@ def profile(step: StepResult | None, part: Mapping[str, Any]) -> list[dict[str, 
     if step is None:
         return []
     columns: dict[str, Any] = {"angle_deg": step.angle_deg, "step_mm": step.step_mm, "u_mm": step.u_mm}
-    columns |= {name: column for name in BOTH_STEPS if (column := getattr(step, name)) is not None}
+    columns |= {name: column for name in ("band_mm", *BOTH_STEPS) if (column := getattr(step, name)) is not None}
     rows = zip(*(column[step.measured].tolist() for column in columns.values()), strict=True)
     named = [dict(zip(columns, row, strict=True)) for row in rows]
     return [_along(row["angle_deg"], part) | row for row in named]

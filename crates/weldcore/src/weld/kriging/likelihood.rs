@@ -46,8 +46,8 @@ impl Prior {
 
 /// A search ends where the corners of the simplex cost the same to this: a third of what one standard deviation costs.
 const CLOSE: f64 = 0.3;
-/// Sweeps of one search.
-const MOST_SWEEPS: usize = 80;
+/// Sweeps of one search: from nothing, and from what is about known.
+const MOST_SWEEPS: [usize; 2] = [60, 24];
 /// First steps of the logarithms, and of a search that begins near its end.
 const STEPS: [f64; 4] = [0.8, 0.5, 0.5, 0.4];
 const SHORT: f64 = 0.4;
@@ -59,7 +59,7 @@ pub(crate) fn fit_alone(line: &Line, wall: &Wall, columns: &Columns, size: usize
         let reduced = sweep(line, wall, &scales, &[])?;
         Some(Border::join(size, &[(&reduced, columns)])?.cost + price)
     };
-    search(prior.start(), STEPS, &cost).map(|logs| prior.read(&logs).0)
+    search(prior.start(), STEPS, MOST_SWEEPS[0], &cost).map(|logs| prior.read(&logs).0)
 }
 
 /// The scales of both walls, each beside the other as it was begun with, on a thread of its own.
@@ -81,14 +81,19 @@ pub(crate) fn fit(
         };
         let Scales { sd_mm, along_mm, across_mm, noise } = near[k];
         let start = [sd_mm, along_mm, across_mm, noise].map(f64::ln);
-        search(start, STEPS.map(|s| SHORT * s), &cost).map(|logs| priors[k].read(&logs).0)
+        search(start, STEPS.map(|s| SHORT * s), MOST_SWEEPS[1], &cost).map(|logs| priors[k].read(&logs).0)
     };
     let (first, second) = threads::install(|| rayon::join(|| beside(0), || beside(1)));
     Some([first?, second?])
 }
 
 /// The least cost by a simplex of five corners; `None` where the cost has no value at the start.
-fn search(start: [f64; 4], steps: [f64; 4], cost: &impl Fn(&[f64; 4]) -> Option<f64>) -> Option<[f64; 4]> {
+fn search(
+    start: [f64; 4],
+    steps: [f64; 4],
+    most: usize,
+    cost: &impl Fn(&[f64; 4]) -> Option<f64>,
+) -> Option<[f64; 4]> {
     let worth = |logs: &[f64; 4]| cost(logs).unwrap_or(f64::INFINITY);
     let mut corners: Vec<([f64; 4], f64)> = vec![(start, cost(&start)?)];
     for k in 0..4 {
@@ -97,7 +102,7 @@ fn search(start: [f64; 4], steps: [f64; 4], cost: &impl Fn(&[f64; 4]) -> Option<
         corners.push((corner, worth(&corner)));
     }
     let mut sweeps = corners.len();
-    while sweeps < MOST_SWEEPS {
+    while sweeps < most {
         corners.sort_by(|a, b| a.1.total_cmp(&b.1));
         if corners[4].1 - corners[0].1 < CLOSE {
             break;
@@ -137,9 +142,9 @@ mod tests {
     #[test]
     fn the_search_finds_the_bottom_of_a_narrow_valley() {
         let cost = |x: &[f64; 4]| Some(50.0 * (x[0] + 0.5 * x[1] - 1.0).powi(2) + x[1] * x[1] + (x[2] - 2.0).powi(2) + 5.0 * x[3] * x[3]);
-        let found = search([0.0, 1.0, 0.0, 1.0], STEPS, &cost).unwrap();
+        let found = search([0.0, 1.0, 0.0, 1.0], STEPS, 100, &cost).unwrap();
         assert!(cost(&found).unwrap() < CLOSE, "{found:?}");
-        assert!(search([0.0; 4], STEPS, &|_| None).is_none());
+        assert!(search([0.0; 4], STEPS, 100, &|_| None).is_none());
     }
 
     #[test]

@@ -50,6 +50,14 @@ pub(super) fn subtract_product(out: &mut [f64], w: &[f64], width: usize, z: &[f6
     }
 }
 
+/// The lower triangle of `out -= WᵀW`; both have rows of `width`.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+pub(super) fn subtract_gram(out: &mut [f64], w: &[f64], width: usize) {
+    for (i, out) in out.chunks_exact_mut(width).enumerate() {
+        add_rows(&mut out[..=i], w, width, 0, |k| -w[k * width + i]);
+    }
+}
+
 /// `L⁻¹ R` in place; L is the lower factor, `size` square, R has rows of `columns`.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
 pub(super) fn forward(lower: &[f64], size: usize, right: &mut [f64], columns: usize) {
@@ -153,6 +161,11 @@ mod tests {
         let mut out = vec![0.0; width * columns];
         subtract_product(&mut out, &w, width, &z, columns);
         assert!((DMatrix::from_row_slice(width, columns, &out) + wm.tr_mul(&zm)).amax() < 1e-14);
+
+        let mut square = vec![0.0; width * width];
+        subtract_gram(&mut square, &w, width);
+        let expected = wm.tr_mul(&wm);
+        assert!((0..width).all(|i| (0..=i).all(|j| (square[i * width + j] + expected[(i, j)]).abs() < 1e-14)));
 
         let positive = zm.tr_mul(&zm) + DMatrix::identity(columns, columns);
         let mut lower: Vec<f64> = positive.transpose().as_slice().to_vec();

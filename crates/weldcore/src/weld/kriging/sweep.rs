@@ -9,7 +9,7 @@
 
 use super::basis::Basis;
 use super::chain::{Chain, Two, correlation, transposed};
-use super::rows::{add_cell, add_gram, cholesky, forward, subtract_product};
+use super::rows::{add_cell, add_gram, cholesky, forward, subtract_gram, subtract_product};
 use super::wall::{Asked, Line, Scales, Wall};
 use crate::ground::stop::poll;
 
@@ -84,7 +84,7 @@ pub(crate) fn sweep(line: &Line, wall: &Wall, scales: &Scales, asked: &[Asked]) 
         }
         couple_within(&mut own, &block, rank, &chain);
         if let Some(before) = &before {
-            subtract_product(&mut own, &before.links, size, &before.links, size);
+            subtract_gram(&mut own, &before.links, size);
             subtract_product(&mut right, &before.links, size, &live.laid_out(before, size), wide);
         }
         log_det += cholesky(&mut own, size)?;
@@ -248,7 +248,7 @@ fn log_det_of_chain(line: &Line, chain: &Chain) -> Option<f64> {
         }
         couple_within(&mut own, &block, 1, chain);
         if let Some(carry) = &carry {
-            subtract_product(&mut own, carry, size, carry, size);
+            subtract_gram(&mut own, carry, size);
         }
         log_det += cholesky(&mut own, size)?;
         let mut next = couple_to_next(line, 1, chain);

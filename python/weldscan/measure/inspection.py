@@ -516,7 +516,11 @@ def _set_record(error: SetPhaseError) -> dict[str, Any]:
 
 BUDGET = (
     ("fit_mm", "noise, terms", "noise, and the terms that walls and shots share, extrapolated to the seam"),
-    ("unevenness_mm", "unevenness at the seam", "the walls' unevenness, as far as their cells do not tell it at the seam"),
+    (
+        "unevenness_mm",
+        "unevenness at the seam",
+        "the walls' unevenness, as far as their cells do not tell it at the seam",
+    ),
     ("angle_mm", "angle", "hand-eye and robot rotation, and the axis on a short arc, times the slope of the profile"),
 )
 

@@ -57,8 +57,8 @@ def seam_terms(step: FittedTerms, outside_diameter_mm: float, wall_mm: float) ->
 
     Args:
         step: what `measure_step` returned: radius difference with its standard uncertainty, axis offset and angle, with
-            theirs along their own direction; infinite or NaN where it has none. And the step's waves around the seam, each
-            as (n, cosine, sine, their standard uncertainties, their prior's).
+            theirs along their own direction; infinite or NaN where it has none. And the step's waves around the seam,
+            each as (n, cosine, sine, their standard uncertainties, their prior's).
         outside_diameter_mm: rated.
         wall_mm: rated thickness of the wall.
 

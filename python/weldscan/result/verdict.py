@@ -82,7 +82,7 @@ class Judgement:
 
     @property
     def probability_over_limit(self) -> float | None:
-        """Of |h| > L by its quantiles, or for a normal distribution about the value with u = U/2 (JCGM 106), both sides."""
+        """Of |h| > L by its quantiles, or for a normal distribution about the value with u = U/2 (JCGM 106)."""
         if self.interval_mm is None or self.limit_mm is None:
             return None
         if self.quantiles_mm:

@@ -265,7 +265,7 @@ fn measure_step(
         Some(given) => {
             let one = |m: &Bound<'_, PyAny>| transform(NAME, &float_matrix(NAME, m)?).map(Some);
             given.iter().map(one).collect::<PyResult<Vec<_>>>()?
-        },
+        }
         None => vec![None; shots.len()],
     };
     let views: Vec<LabelledShot> = shots

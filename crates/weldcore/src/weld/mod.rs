@@ -1,8 +1,8 @@
 //! The weld: its walls and cap, the step around the seam, and what became of every pixel.
 
 pub mod agreement;
-mod kriging;
 mod coarse;
+mod kriging;
 mod label;
 pub mod paper;
 pub mod place;

@@ -80,7 +80,13 @@ mod tests {
             let n = 12;
             let mut precision = DMatrix::<f64>::zeros(2 * n, 2 * n);
             for c in 0..n {
-                let own = if c == 0 { chain.first } else if c == n - 1 { chain.last } else { chain.inner };
+                let own = if c == 0 {
+                    chain.first
+                } else if c == n - 1 {
+                    chain.last
+                } else {
+                    chain.inner
+                };
                 for i in 0..2 {
                     for j in 0..2 {
                         precision[(2 * c + i, 2 * c + j)] = own[i][j];

@@ -46,9 +46,8 @@ pub(crate) fn largest(value: &[f64], covariance: &[f64]) -> Option<Largest> {
     (0..n).for_each(|k| lower[k * n + k] += JITTER * most);
     cholesky(&mut lower, n)?;
     let batches: Vec<usize> = (0..DRAWS / TOGETHER).collect();
-    let drawn: Vec<Vec<(f64, f64)>> = threads::install(|| {
-        batches.par_iter().map(|batch| draw(batch * TOGETHER, value, &sigma, &lower)).collect()
-    });
+    let drawn: Vec<Vec<(f64, f64)>> =
+        threads::install(|| batches.par_iter().map(|batch| draw(batch * TOGETHER, value, &sigma, &lower)).collect());
     let (mut sorted, mut ratio): (Vec<f64>, Vec<f64>) = drawn.into_iter().flatten().unzip();
     sorted.sort_by(f64::total_cmp);
     ratio.sort_by(f64::total_cmp);

@@ -141,7 +141,8 @@ mod tests {
     use super::*;
 
     fn matrix(rows: usize, columns: usize, seed: u64) -> Vec<f64> {
-        let place = |k: u64| (crate::ground::random::mix(seed.wrapping_add(k)) >> 11) as f64 / (1_u64 << 53) as f64 - 0.5;
+        let place =
+            |k: u64| (crate::ground::random::mix(seed.wrapping_add(k)) >> 11) as f64 / (1_u64 << 53) as f64 - 0.5;
         (0..rows * columns).map(|k| place(k as u64)).collect()
     }
 

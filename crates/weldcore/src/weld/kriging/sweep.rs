@@ -56,7 +56,9 @@ pub(crate) fn sweep(line: &Line, wall: &Wall, scales: &Scales, asked: &[Asked]) 
         let of_shots = shots.flat_map(|k| wall.width.of_shot(k)..wall.width.of_shot(k + 1));
         let of_asked = block.iter().flat_map(|c| asked_in[*c].iter().map(|k| border + 1 + k));
         let carried = before.as_ref().map_or(&[][..], |b| &b.listed);
-        live.list((0..wall.width.common).chain([border]).chain(of_shots).chain(of_asked).chain(carried.iter().copied()));
+        live.list(
+            (0..wall.width.common).chain([border]).chain(of_shots).chain(of_asked).chain(carried.iter().copied()),
+        );
         let wide = live.listed.len();
         let mut own = vec![0.0; size * size];
         let mut right = vec![0.0; size * wide];

@@ -45,7 +45,7 @@ fn case(closed: bool) -> Case {
                         column,
                         along_mm: 0.5 * next(),
                         across_mm: sign * (5.0 * f64::from(row) + next()),
-                        height_mm: 0.2 * next() + 0.1 * k as f64,
+                        height_mm: 0.05 * next() + 0.01 * k as f64,
                         weight: 2e4 * (1.0 + next()),
                         shot,
                     });

@@ -239,5 +239,8 @@ pub(super) fn line_of(columns: &Columns, walls: &[WallCells; 2]) -> (Line, usize
     }
     // Bins reach a cell's half beyond its middle.
     let margin = columns.of_a_bin.max(columns.of_a_cell);
-    (Line { columns: end - start + 1 + 2 * margin, spacing_mm, closed: false }, (start + columns.around - margin) % columns.around)
+    (
+        Line { columns: end - start + 1 + 2 * margin, spacing_mm, closed: false },
+        (start + columns.around - margin) % columns.around,
+    )
 }

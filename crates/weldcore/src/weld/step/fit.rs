@@ -4,7 +4,9 @@ use super::cells::{Columns, Gathered, line_of};
 use super::terms::Terms;
 use crate::error::{Error, Result};
 use crate::ground::threads;
-use crate::weld::kriging::{Answer, Asked, Border, Cell, Columns as BorderColumns, Line, Prior, Reduced, Scales, Wall, fit, fit_alone, sweep};
+use crate::weld::kriging::{
+    Answer, Asked, Border, Cell, Columns as BorderColumns, Line, Prior, Reduced, Scales, Wall, fit, fit_alone, sweep,
+};
 
 /// So many shots, that share as little of the seam as may be, tell what the walls are like: the others see the same waves.
 const SHOTS_FOR_SCALES: usize = 8;
@@ -179,7 +181,8 @@ impl Equations {
     pub fn solve(&self, scales: &[Scales; 2], asked: [&[Asked]; 2], rows: &[f64]) -> Result<Solved> {
         let reduced = self.swept(scales, asked)?;
         let walls = [(&reduced[0], &self.border[0]), (&reduced[1], &self.border[1])];
-        let border = Border::join(self.terms.count(), &walls).ok_or_else(|| degenerate("its terms have no solution"))?;
+        let border =
+            Border::join(self.terms.count(), &walls).ok_or_else(|| degenerate("its terms have no solution"))?;
         let answer = border.answer(rows, &walls);
         if answer.value.iter().chain(&answer.covariance).any(|v| !v.is_finite()) {
             return Err(degenerate("the fit of the walls did not converge"));

@@ -174,10 +174,10 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
     let posed = shots.iter().all(|s| s.base_from_scanner.is_some());
     let terms = Terms::new(seam.course, thickness_mm, views.iter().map(|v| v.middle).collect(), posed);
     let equations = Equations::of(columns, &gathered, terms);
-    let (rows_mm, reach_mm) = (gathered.walls.each_ref().map(|w| w.row_mm), gathered.walls.each_ref().map(|w| w.reach_mm));
-    let bins: Vec<usize> = (0..gathered.seen.len())
-        .filter(|bin| gathered.seen[*bin] && equations.column_of_bin(*bin).is_some())
-        .collect();
+    let (rows_mm, reach_mm) =
+        (gathered.walls.each_ref().map(|w| w.row_mm), gathered.walls.each_ref().map(|w| w.reach_mm));
+    let bins: Vec<usize> =
+        (0..gathered.seen.len()).filter(|bin| gathered.seen[*bin] && equations.column_of_bin(*bin).is_some()).collect();
     if bins.is_empty() {
         return Err(Error::NotFound { what: "step", reason: "no angle at which both walls were seen".into() });
     }
@@ -242,11 +242,11 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
         // Of a vector's length: its covariance along its own direction.
         let length = value[0].hypot(value[1]);
         let towards = if length > 0.0 { value.map(|v| v / length) } else { [1.0, 0.0] };
-        let along: Vec<f64> =
-            rows[0].iter().zip(&rows[1]).map(|(a, b)| towards[0] * a + towards[1] * b).collect();
+        let along: Vec<f64> = rows[0].iter().zip(&rows[1]).map(|(a, b)| towards[0] * a + towards[1] * b).collect();
         (value, told(&along).1)
     };
-    let ((offset_mm, offset_standard_mm), (lean, tilt_standard_rad)) = (pair(terms.offset_rows()), pair(terms.lean_rows()));
+    let ((offset_mm, offset_standard_mm), (lean, tilt_standard_rad)) =
+        (pair(terms.offset_rows()), pair(terms.lean_rows()));
     let waves = terms.round_rows().map(|(n, rows, prior_mm)| {
         let [c, s] = rows.map(|r| told(&r));
         Wave { n, amplitude_mm: [c.0, s.0], standard_mm: [c.1, s.1], prior_mm }
@@ -266,11 +266,7 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
         tilt_standard_rad,
         waves: waves.collect(),
         shrinkage_mm: terms.drawn_rows().map(|row| told(&row)),
-        unevenness: scales.map(|s| Unevenness {
-            sd_mm: s.sd_mm,
-            reach_mm: [s.along_mm, s.across_mm],
-            noise: s.noise,
-        }),
+        unevenness: scales.map(|s| Unevenness { sd_mm: s.sd_mm, reach_mm: [s.along_mm, s.across_mm], noise: s.noise }),
         residual_rms_mm: (residuals.iter().map(|r| r * r).sum::<f64>() / residuals.len() as f64).sqrt(),
         cells: residuals.len(),
         covariance_mm2: answer.covariance.clone(),

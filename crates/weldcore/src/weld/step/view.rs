@@ -54,7 +54,8 @@ impl LabelledShot<'_> {
 /// The seam that all shots are counted about: of one shot its own; of several the mean of theirs in base, with the surface that
 /// fits the reference wall of all of them.
 pub(super) fn common_seam(shots: &[LabelledShot]) -> Result<Seam> {
-    let (first, rest) = shots.split_first().ok_or(Error::TooFew { what: "part shots with both walls", needed: 1, got: 0 })?;
+    let (first, rest) =
+        shots.split_first().ok_or(Error::TooFew { what: "part shots with both walls", needed: 1, got: 0 })?;
     let Some(placed) = first.base_from_scanner else {
         return Ok(Seam { course: Course::mean(shots.iter().map(|s| s.seam.course)), ..first.seam });
     };
@@ -62,8 +63,7 @@ pub(super) fn common_seam(shots: &[LabelledShot]) -> Result<Seam> {
     if rest.is_empty() {
         return Ok(own);
     }
-    let seams =
-        shots.iter().filter_map(|s| in_base(&s.seam, &s.base_from_scanner?).ok()).collect::<Vec<Seam>>();
+    let seams = shots.iter().filter_map(|s| in_base(&s.seam, &s.base_from_scanner?).ok()).collect::<Vec<Seam>>();
     let mean = |pick: fn(&Seam) -> Vec3| seams.iter().map(pick).sum::<Vec3>() / seams.len() as f64;
     let course = Course::mean(seams.iter().map(|s| s.course));
     let start = Seam::new(mean(|s| s.origin_mm), mean(|s| s.across), mean(|s| s.zero), course)?;
@@ -114,7 +114,8 @@ impl View {
         // Any place about the middle will do to count from.
         let some = (0..shot.labels.len()).step_by(MIDDLE_STRIDE).filter(|i| is_wall(shot.labels[*i]).is_some());
         let own_middle = own.middle(some.map(|i| u.at[i]));
-        let walls = |range: std::ops::Range<usize>| range.filter_map(|i| Some((i, usize::from(is_wall(shot.labels[i])?))));
+        let walls =
+            |range: std::ops::Range<usize>| range.filter_map(|i| Some((i, usize::from(is_wall(shot.labels[i])?))));
         let (mut count, mut own_half, mut far) = ([0_usize; 2], 0.0_f64, 1.0_f64);
         for (more, half, reach) in threads::map_ranges(shot.labels.len(), |range| {
             let (mut count, mut half, mut far) = ([0_usize; 2], 0.0_f64, 1.0_f64);

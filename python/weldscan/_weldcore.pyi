@@ -599,7 +599,7 @@ class WeldShot:
 
 def seam_fates(
     shot: WeldShot, reason: NDArray[np.uint8], scanner: Scanner
-) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]: ...
+) -> tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32]]: ...
 def segment_weld(
     points_mm: ArrayLike,
     radius_mm: float,

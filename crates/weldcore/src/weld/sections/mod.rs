@@ -17,6 +17,7 @@ mod direction;
 mod doubts;
 mod edges;
 mod grid;
+mod local;
 mod profile;
 mod read;
 mod station;

@@ -80,6 +80,9 @@ impl View<'_> {
         for (side, scatter) in [0, 1].map(|side| (side, toe_scatter(&stations, side))) {
             stations.iter_mut().for_each(|s| s.toes_standard_mm[side] = s.toes_standard_mm[side].hypot(scatter));
         }
+        let local: Vec<Option<f64>> =
+            threads::install(|| (0..count).into_par_iter().map(|k| self.local_step(&stations, k)).collect());
+        stations.iter_mut().zip(local).for_each(|(station, local)| station.local_step_mm = local);
         let directions = direction::directions(&stations);
         let read: Vec<Option<(Edge, Bevels)>> = threads::install(|| {
             let read = |k: usize| {
@@ -160,6 +163,7 @@ impl View<'_> {
             },
             height_mm: 0.0,
             edge: None,
+            local_step_mm: None,
             undisturbed_mm: [None; 2],
             departure_mm: [0.0; 2],
             wall_step_mm: None,

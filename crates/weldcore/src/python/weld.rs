@@ -5,7 +5,7 @@ mod paper;
 mod whitening;
 
 use numpy::{
-    IntoPyArray, Ix3, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
+    IntoPyArray, IxDyn, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
     PyReadonlyArrayDyn, PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
@@ -158,7 +158,8 @@ fn direction(py: Python<'_>, what: &'static str, given: Option<&Bound<'_, PyAny>
 
 /// Cuts one part shot into reference wall, other wall and bead, without seeds.
 ///
-/// points_mm: (H, W, 3) float64, NaN where there is no point, one frame (the scanner's: the scanner stands at its origin).
+/// points_mm: (H, W, 3) float64, NaN where there is no point, or a cloud (n, 3) in any order; one frame (the scanner's: the
+/// scanner stands at its origin).
 /// radius_mm, wall_thickness_mm: the pipe's nominal ones. axis: (3,), from the reference wall to the other wall, in the
 /// frame of the points, within some degrees; None: from the points. zero: (3,), towards angle 0; None: angle 0 faces the
 /// scanner. Returns a WeldShot. Raises InputError on bad arguments, GeometryError with the reason where no weld or
@@ -173,20 +174,21 @@ fn segment_weld(
     axis: Option<&Bound<'_, PyAny>>,
     zero: Option<&Bound<'_, PyAny>>,
 ) -> PyResult<WeldShot> {
-    let points_mm = floats::<Ix3>("points_mm", points_mm)?;
-    let shape = points_mm.shape().to_vec();
+    let points_mm = floats::<IxDyn>("points_mm", points_mm)?;
     let wrong = |got: String| {
-        let expected = "an array of shape (H, W, 3)".into();
+        let expected = "an array of shape (H, W, 3) or (n, 3)".into();
         raise(py, &Error::Shape { what: "points_mm", expected, got })
     };
-    if shape[2] != 3 {
-        return Err(wrong(format!("shape {shape:?}")));
-    }
+    let width = match *points_mm.shape() {
+        [_, 3] => 1,
+        [_, width, 3] => width,
+        ref shape => return Err(wrong(format!("shape {shape:?}"))),
+    };
     let points = points_mm.as_slice().map_err(|_| wrong("strided".into()))?.as_chunks::<3>().0;
     let (axis, zero) = (direction(py, "axis", axis)?, direction(py, "zero", zero)?);
     let segmented = compute(py, || {
         let course = Course::of_radius(radius_mm)?;
-        segment::segment(points, shape[1], &Nominal { course, wall_thickness_mm, axis, zero })
+        segment::segment(points, width, &Nominal { course, wall_thickness_mm, axis, zero })
     });
     segmented.map(WeldShot)
 }

@@ -155,8 +155,8 @@ mod tests {
             assert_eq!(lost, cells.iter().map(|c| c[0] - c[1]).sum::<u32>());
         }
         let dark = found.cells.iter().filter(|c| c[0] > 50 && 20 * c[1] < c[0]).count();
-        // 20 rows of half a millimetre, in cells of two.
-        assert!((3..=6).contains(&dark), "{dark}");
+        // 20 rows of half a millimetre, in cells of two; where a dark pixel lies is known to about a row.
+        assert!((2..=6).contains(&dark), "{dark}");
         assert!(seam_fates(&shot, &reasons[1..], &camera).is_err());
     }
 }

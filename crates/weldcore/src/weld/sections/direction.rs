@@ -81,7 +81,8 @@ fn along(values: &[Option<[f64; 2]>]) -> Vec<Option<[f64; 2]>> {
     let independent =
         independent(&residuals.iter().map(|r| r.clamp(-3.0 * scatter, 3.0 * scatter)).collect::<Vec<f64>>());
     let usual = median(&mut values.iter().flatten().map(|v| v[1]).collect::<Vec<f64>>());
-    let u = scatter.max(usual) * (TERMS / independent).sqrt().min(1.0);
+    // What is left scatters less than what was fitted, by the terms that were.
+    let u = scatter.max(usual) * (TERMS / (independent - TERMS).max(1.0)).sqrt();
     (0..values.len()).map(|k| Some([row(k).dot(&terms), u])).collect()
 }
 

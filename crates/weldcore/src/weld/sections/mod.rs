@@ -16,6 +16,7 @@ mod cap;
 mod direction;
 mod doubts;
 mod edges;
+mod foot;
 mod grid;
 mod local;
 mod profile;

@@ -71,10 +71,10 @@ fn of_cloud(points: &[[f64; 3]]) -> Result<Vec<(Vec3, Vec3)>> {
     Ok(pairs.filter(|(_, n)| n.x.is_finite()).collect())
 }
 
-/// A cylinder of the nominal radius near the points, a grid or bare ones in one column: axis from the normals, place from a
+/// A cylinder of the nominal radius near the points, a grid or bare ones in one column or row: axis from the normals, place from a
 /// vote of `p - R n`, both then refined with the points that agree. Degrees and millimetres suffice.
 pub(super) fn coarse_frame(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<Seam> {
-    let seen = if width == 1 { of_cloud(points)? } else { of_grid(points, width) };
+    let seen = if width == 1 || width == points.len() { of_cloud(points)? } else { of_grid(points, width) };
     require_count("part points with a normal", 100, seen.len())?;
     let axis = axis_from_normals(&seen, nominal)?;
     let middle = seen.iter().map(|(p, _)| p).sum::<Vec3>() / seen.len() as f64;

@@ -203,7 +203,7 @@ impl Course {
 
     /// How the height of a wall at a place grows with its offset, per mm in each of two directions.
     #[inline]
-    pub(super) fn offset(self, at: f64) -> [f64; 2] {
+    pub(in crate::weld) fn offset(self, at: f64) -> [f64; 2] {
         let (sin, cos) = at.sin_cos();
         [cos, sin]
     }

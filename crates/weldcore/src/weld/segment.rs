@@ -43,8 +43,8 @@ const GATE_THICKNESSES: f64 = 2.0;
 const STRIP_HEIGHTS: f64 = 1.7;
 /// Points so many stations beyond the outermost ones, in the corners of a view, are held against those.
 const CORNER_STATIONS: f64 = 4.0;
-/// Segments one shot. `points` is a pixel grid `width` wide, row-major, NaN where there is no point; in one column they are a
-/// cloud, in any order.
+/// Segments one shot. `points` is a pixel grid `width` wide, row-major, NaN where there is no point; in one column or row
+/// they are a cloud, in any order.
 ///
 /// # Errors
 /// [`Error::Shape`], [`Error::OutOfRange`] on bad arguments; [`Error::TooFew`] where there is next to nothing;

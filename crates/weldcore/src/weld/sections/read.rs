@@ -92,7 +92,7 @@ impl View<'_> {
         let local: Vec<Option<f64>> =
             threads::install(|| (0..count).into_par_iter().map(|k| self.local_step(&stations, k)).collect());
         stations.iter_mut().zip(local).for_each(|(station, local)| station.local_step_mm = local);
-        let directions = direction::directions(&stations);
+        let directions = direction::directions(&stations, self.grid.course);
         let read: Vec<Option<(Edge, Bevels)>> = threads::install(|| {
             let read = |k: usize| {
                 let station = &stations[k];

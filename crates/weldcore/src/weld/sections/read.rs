@@ -47,7 +47,7 @@ impl View<'_> {
         let n = profile.len();
         let band = band.map(|[low, high]| [-high, -low]);
         let toe = toes::toe(profile, n - candidate.to, n - candidate.from, self.sigma, band)?;
-        Some(Toe { at: -toe.at, from: -toe.to, to: -toe.from })
+        Some(Toe { at: -toe.at, from: -toe.to, to: -toe.from, ..toe })
     }
 
     pub(super) fn stations(&self, found: &Found) -> Vec<Station> {
@@ -61,7 +61,7 @@ impl View<'_> {
                         let c = chosen[k].as_ref()?;
                         if found.kind == Kind::Flush {
                             let at = c.toes[side];
-                            return Some(Toe { at, from: at, to: at });
+                            return Some(Toe { at, from: at, to: at, undercut_mm: 0.0 });
                         }
                         self.toe(k, c, side, None)
                     })
@@ -128,14 +128,14 @@ impl View<'_> {
                 let Some(usual) = running_median(&at, k, 4) else { continue };
                 if (own - usual).abs() > band {
                     // Where a hole is in its place, it is known from its neighbours alone.
-                    let by_neighbours = Toe { at: usual, from: usual - band, to: usual + band };
+                    let by_neighbours = Toe { at: usual, from: usual - band, to: usual + band, undercut_mm: 0.0 };
                     let again = self.toe(k, c, side, Some([usual - band, usual + band])).unwrap_or(by_neighbours);
                     // What the free search found stays plausible.
                     let first = toes[k][side].map_or([own, own], |t| [t.from, t.to]);
                     let kept = (first[0] - usual).abs().max((first[1] - usual).abs()) <= 2.0 * band;
                     let (from, to) =
                         if kept { (again.from.min(first[0]), again.to.max(first[1])) } else { (again.from, again.to) };
-                    toes[k][side] = Some(Toe { at: again.at, from, to });
+                    toes[k][side] = Some(Toe { from, to, ..again });
                 }
             }
         }
@@ -147,7 +147,7 @@ impl View<'_> {
         let by_course = toes.iter().any(Option::is_none);
         let toes: [Toe; 2] = std::array::from_fn(|side| {
             let at = middle + usual[side];
-            toes[side].unwrap_or(Toe { at, from: at - WANDER_MM, to: at + WANDER_MM })
+            toes[side].unwrap_or(Toe { at, from: at - WANDER_MM, to: at + WANDER_MM, undercut_mm: 0.0 })
         });
         let own = &self.own[k];
         let seen = {
@@ -250,7 +250,12 @@ impl View<'_> {
                 hull_mm: hull + direction.spread * width,
                 foot_mm: foot,
             };
-            Some((edge, if flush { [None; 2] } else { [a.bevel, b.bevel] }))
+            let bevel = |side: usize, read: Option<[f64; 2]>| match read {
+                _ if flush => None,
+                Some([off, _]) if off.abs() < toes[side].undercut_mm => Some([toes[side].undercut_mm, self.sigma]),
+                read => read,
+            };
+            Some((edge, [bevel(0, a.bevel), bevel(1, b.bevel)]))
         };
         let middle = 0.5 * (toes[0].at + toes[1].at);
         if found.kind == Kind::Flush {
@@ -344,7 +349,12 @@ impl View<'_> {
                 moved.iter().any(Option::is_some).then(|| {
                     [0, 1].map(|side| {
                         let sign = if side == 0 { -1.0 } else { 1.0 };
-                        let about = |x: f64| Toe { at: sign * x, from: sign * x - FLARE_MM, to: sign * x + FLARE_MM };
+                        let about = |x: f64| Toe {
+                            at: sign * x,
+                            from: sign * x - FLARE_MM,
+                            to: sign * x + FLARE_MM,
+                            undercut_mm: 0.0,
+                        };
                         moved[side].map_or(toes[k][side], about)
                     })
                 })

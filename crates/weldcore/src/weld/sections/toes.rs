@@ -31,6 +31,8 @@ pub(super) struct Toe {
     pub at: f64,
     pub from: f64,
     pub to: f64,
+    /// Depth of an undercut inside it, drawn on to its inner side: it may as well be a bevel of the wall.
+    pub undercut_mm: f64,
 }
 
 /// The toe of a cap whose candidate ends at the bin boundary `end` and begins at `begin`; `band` narrows the search.
@@ -74,7 +76,7 @@ pub(super) fn toe(profile: &Profile, begin: usize, end: usize, sigma: f64, band:
             at = 0.5 * (low + high);
         }
     }
-    let found = Toe { at, from: range[0].min(at), to: range[1].max(at) };
+    let found = Toe { at, from: range[0].min(at), to: range[1].max(at), undercut_mm: 0.0 };
     Some(beyond_undercut(profile, found, sigma).unwrap_or(found))
 }
 
@@ -87,11 +89,14 @@ fn beyond_undercut(profile: &Profile, toe: Toe, sigma: f64) -> Option<Toe> {
     let below = |i: usize| wall.at(profile.x(i)) - profile.heights[i];
     // Two beside each other, so that no single bin is one.
     let last = (inside..beyond).rev().find(|&i| below(i) > seen && i > 0 && below(i - 1) > seen)? + 1;
-    let deepest = (inside..last).map(below).filter(|d| d.is_finite()).fold(0.0, f64::max);
+    let depths = (inside..last).map(|i| (below(i), i)).filter(|d| d.0.is_finite());
+    let (deepest, bottom) = depths.max_by(|a, b| a.0.total_cmp(&b.0))?;
     // A wall that bends down towards the weld comes back to nothing.
     let comes_back = last + quiet <= beyond && deepest > 2.0 * seen;
     let at = profile.edge(last);
-    (comes_back && at > toe.at).then(|| Toe { at, from: toe.from, to: toe.to.max(at + profile.bin) })
+    // A bin tells the mean of its width: a bevel goes on beyond the middle of the lowest one.
+    let undercut_mm = deepest * (1.0 + profile.bin / (at - profile.x(bottom)));
+    (comes_back && at > toe.at).then(|| Toe { at, from: toe.from, to: toe.to.max(at + profile.bin), undercut_mm })
 }
 
 /// The bin from which the flank is looked at.

@@ -217,12 +217,14 @@ def solve_scanner(
     f = _features(checked)
     first = bundle.start(f, camera_size, projector_size)
     priors = bundle.prior_sigmas(first, camera_size, projector_size)
-    solved = bundle.solve(f, first, priors, k3=k3)
+    rough = bundle.solve(f, first, priors, k3=k3, rough=True)
     for _ in range(2 if any(view.diameter_mm for view in checked) else 0):
-        f = _without_bias(_features(checked), checked, solved.model)
-        solved = bundle.solve(f, solved.model, priors, k3=k3)
-    if board_shape or (board_shape is None and bundle.repeats(f, solved)):
-        solved = bundle.solve_with_board(f, solved, k3=k3)
+        f = _without_bias(_features(checked), checked, rough.model)
+        rough = bundle.solve(f, rough.model, priors, k3=k3, rough=True)
+    if board_shape or (board_shape is None and bundle.repeats(f, rough)):
+        solved = bundle.solve_with_board(f, rough)
+    else:
+        solved = bundle.solve(f, rough.model, priors, k3=k3)
     return _result(checked, f, solved, linked, camera_size, projector_size, board, temperature_c, valid_days, date)
 
 

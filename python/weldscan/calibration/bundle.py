@@ -14,8 +14,8 @@ that place is in both. With G = dw/dx, the slope of the phase field, the two ind
 by Levenberg-Marquardt with analytic Jacobians. A feature in a view touches the lenses, that view's pose and its own
 place on the board, so the normal equations are summed view by view and feature by feature, and the poses (with the
 board's shape: the features) are eliminated block by block (Schur complement). The scales s_c and s_p come from the
-median residual. The covariance is that of the M-estimate (P. Huber, Robust Statistics (1981), 7.6) with each device's variance
-from its own redundancy (K.-R. Koch, Parameter Estimation (1999), 3.6).
+median residual. The covariance is that of the M-estimate (P. Huber, Robust Statistics (1981), 7.6) with each device's
+variance from its own redundancy (K.-R. Koch, Parameter Estimation (1999), 3.6).
 
 A printed board is neither flat nor as drawn. Where the residuals show it (`repeats`), the board's own shape is solved
 for as well: a bow, a stretch and a shear of the whole board with wide priors, for lenses and poses take up most of them
@@ -847,8 +847,8 @@ def _widths(p: _Problem, model: BundleModel, data: _Normal) -> Floats:
     """How far the board's features are off the drawing: (3,) mm, twice in its plane, and out of it.
 
     Variance components: of n coordinates with the prior's variance v, n tau are told by the views, the rest by the
-    prior, and the sum of their squares is to be n tau v. Where all are told alike, their mean square, freed of the prior
-    and of the noise, is the answer at once: m / tau^2 - v (1 - tau) / tau.
+    prior, and the sum of their squares is to be n tau v. Where all are told alike, their mean square, freed of the
+    prior and of the noise, is the answer at once: m / tau^2 - v (1 - tau) / tau.
 
     Args:
         p: the problem that was solved.

@@ -32,11 +32,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from weldscan._weldcore import Lens, Scanner
 from weldscan.errors import GeometryError
 from weldscan.geometry import rigid, rotation_of
 
@@ -133,11 +135,38 @@ class BundleModel:
             self.projector + step[PROJECTOR],
             rotation_of(step[18:21]) @ self.turn,
             self.shift + step[21:24],
-            np.array([rotation_of(d[:3]) @ r for d, r in zip(pose_steps, self.turns, strict=True)]),
+            np.array([rotation_of(d[:3]) @ r for d, r in zip(pose_steps, self.turns, strict=True)]).reshape(-1, 3, 3),
             self.shifts + pose_steps[:, 3:],
             self.shape,
             self.bends,
         )
+
+    @classmethod
+    def of(cls, scanner: Scanner, turns: Floats | None = None, shifts: Floats | None = None, features: int = 0) -> Self:
+        """A scanner's numbers, with the poses of a flat board of so many features."""
+
+        def numbers(lens: Lens) -> Floats:
+            k, dist = lens.K, [*lens.dist, 0.0][:5]
+            return np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], *dist])
+
+        relation = scanner.camera_from_projector
+        return cls(
+            numbers(scanner.camera),
+            numbers(scanner.projector),
+            relation[:3, :3],
+            relation[:3, 3],
+            np.empty((0, 3, 3)) if turns is None else turns,
+            np.empty((0, 3)) if shifts is None else shifts,
+            np.zeros((features, 3)),
+        )
+
+    def scanner(self, camera_size: tuple[int, int], projector_size: tuple[int, int]) -> Scanner:
+        """The core's scanner of these numbers; sizes are width, height."""
+        camera, projector = (
+            Lens(*size, [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dist)
+            for size, (fx, fy, cx, cy, *dist) in ((camera_size, self.camera), (projector_size, self.projector))
+        )
+        return Scanner(camera, projector, self.camera_from_projector)
 
     @property
     def camera_from_projector(self) -> Floats:
@@ -170,6 +199,13 @@ class Solution:
     """(views, 24): how PARAMETERS move when one view is left out, to first order."""
     board_sigma_mm: tuple[float, float] | None = None
     """How far the board's features are off the drawing, one coordinate in its plane and out of it; None: not asked."""
+
+    def scaled(self, ratio: float) -> Solution:
+        """With every uncertainty so many times as large."""
+        sigma = self.sigma_px[0] * ratio, self.sigma_px[1] * ratio
+        return replace(
+            self, covariance=self.covariance * ratio**2, information=self.information / ratio**2, sigma_px=sigma
+        )
 
 
 # --- projection with its derivatives ----------------------------------------------------------------------------------

@@ -223,6 +223,7 @@ class _Run:
             base_from_flange(shot) if self.session.has_robot else np.eye(4),
             base_from_scanner,
             segmented,
+            None if self.session.scanner.hull is None else self.session.scanner.hull.build(),
         )
         return view, noticed
 

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from weldscan._weldcore import Lens, Scanner
@@ -25,7 +26,7 @@ from weldscan.records.fields import (
     read_model,
 )
 from weldscan.records.files import inside, plain, to_json, write_file
-from weldscan.result import ScannerCalibration
+from weldscan.result import CalibratedHull, ScannerCalibration
 
 SCHEMA = "weldscan-scanner/2"
 
@@ -57,6 +58,10 @@ class HullSpec(Model):
     camera_px: Polygon
     projector_px: Polygon
     depth_mm: tuple[Positive, Positive]
+
+    def build(self) -> CalibratedHull:
+        """As arrays."""
+        return CalibratedHull(np.array(self.camera_px), np.array(self.projector_px), self.depth_mm)
 
 
 class ScannerSpec(Model):

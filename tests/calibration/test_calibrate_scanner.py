@@ -161,7 +161,7 @@ def test_derivatives_by_the_board_are_those_of_differences():
         shape[:] = off[5:]
         up, down = (bundle.rows_of(replace(model, bends=s * off[:5], shape=s * shape), f).residuals for s in (1, -1))
         slope = (up - down) / 2e-4
-        good, column = np.isfinite(slope), 30 + i if i < 5 else 31 + i
+        good, column = np.isfinite(slope), bundle.BEND.start + i
         assert rows.design[..., column][good] == pytest.approx(slope[good], rel=1e-4, abs=1e-5)
 
 
@@ -268,7 +268,7 @@ def test_normal_equations_are_those_of_the_whole_matrix(board_sigma, twice):
     first = replace(first, shape=random.normal(0, 0.02, first.shape.shape))
     priors, free = bundle.prior_sigmas(first, *sizes(scanner)), np.array([i for i in range(24) if i not in bundle.K3])
     p, rows = bundle._problem(f, first, priors, free, board_sigma), bundle.rows_of(first, f)
-    common = np.concatenate([free, np.arange(30, 35)]) if board_sigma else free
+    common = np.concatenate([free, np.arange(bundle.BEND.start, bundle.BEND.stop)]) if board_sigma else free
     few = len(common)
     weight = random.random((len(f.view), 2)) + 0.5
     weight[~f.seen, 1] = 0

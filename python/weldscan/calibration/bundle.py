@@ -241,9 +241,9 @@ def project(lens: Floats, points: Floats) -> tuple[Floats, Floats, Floats]:
     return np.stack([fx * xd + cx, fy * yd + cy], axis=1), by_lens, by_point
 
 
-# Where the columns of `_Rows.design` stand: lenses and relation, the pose, the bends, the residual, the place on the
-# board.
-LENSES, POSE, BEND, RESIDUAL, PLACE = slice(0, 24), slice(24, 30), slice(30, 30 + BENDS), 30 + BENDS, slice(36, 39)
+# Where the columns of `_Rows.design` stand: lenses and relation, the pose, the residual; with the board's shape the
+# bends and the place on the board.
+LENSES, POSE, RESIDUAL, BEND, PLACE = slice(0, 24), slice(24, 30), 30, slice(31, 31 + BENDS), slice(36, 39)
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,7 +272,7 @@ class _Rows:
         return self.design[..., PLACE]
 
 
-def rows_of(model: BundleModel, f: Features) -> _Rows | None:
+def rows_of(model: BundleModel, f: Features, *, shape: bool = True) -> _Rows | None:
     """All residuals, in pixels, with r_p freed of the corner's error; None where a point is behind a device."""
     turns = model.turns[f.view]
     out_of_plane, in_plane = f.bends
@@ -296,7 +296,7 @@ def rows_of(model: BundleModel, f: Features) -> _Rows | None:
         return None
     # X_p = R^T (X_c - t); a turn exp(w) of R moves it by R^T [X_c - t]x w.
     by_camera_point = (point_p.reshape(-1, 3) @ model.turn.T).reshape(n, 2, 3)
-    design = np.zeros((n, 2, 2, PLACE.stop))
+    design = np.zeros((n, 2, 2, PLACE.stop if shape else BEND.start))
     design[:, 0, :, CAMERA] = lens_c
     design[:, 1, :, PROJECTOR] = lens_p
     design[:, 1, :, 18:21] = _cross(by_camera_point, from_projector)
@@ -304,10 +304,12 @@ def rows_of(model: BundleModel, f: Features) -> _Rows | None:
     for device, by_place in enumerate((point_c, by_camera_point)):
         design[:, device, :, 24:27] = -_cross(by_place, turned)
         design[:, device, :, 27:30] = by_place
-        by_point = np.einsum("nia,nab->nib", by_place, turns)
-        design[:, device, :, 30 : 30 + BOWS] = by_point[..., 2:] * out_of_plane[:, None]
-        design[:, device, :, 30 + BOWS : RESIDUAL] = np.einsum("nic,nmc->nim", by_point[..., :2], in_plane)
-        design[:, device, :, PLACE] = by_point
+        if shape:
+            by_point = np.einsum("nia,nab->nib", by_place, turns)
+            design[:, device, :, BEND.start : BEND.start + BOWS] = by_point[..., 2:] * out_of_plane[:, None]
+            within = np.einsum("nic,nmc->nim", by_point[..., :2], in_plane)
+            design[:, device, :, BEND.start + BOWS : BEND.stop] = within
+            design[:, device, :, PLACE] = by_point
     if f.slope.any():
         design[:, 1] -= f.slope @ design[:, 0]
     design[..., RESIDUAL] = np.nan_to_num(residuals)
@@ -347,7 +349,7 @@ def start(f: Features, camera_size: tuple[int, int], projector_size: tuple[int, 
 def _device(f: Features, pixels: Floats, views: Sequence[int], size: tuple[int, int]) -> tuple[Floats, Floats, Floats]:
     """A device's own calibration: lens (9,), turns and shifts of its views."""
     good = np.isfinite(pixels).all(axis=1)
-    picked = [good & (f.view == i) for i in views]
+    picked = [_some(np.flatnonzero(good & (f.view == i))) for i in views]
     objects = [f.board_mm[k].astype(np.float32) for k in picked]
     images = [pixels[k].astype(np.float32) for k in picked]
     width, height = size
@@ -374,6 +376,17 @@ def _device(f: Features, pixels: Floats, views: Sequence[int], size: tuple[int, 
     lens = np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], d.ravel()[0], 0, 0, 0, 0], dtype=np.float64)
     turns = np.array([cv2.Rodrigues(r)[0] for r in turn], dtype=np.float64)
     return lens, turns, np.array([s.ravel() for s in shift], dtype=np.float64)
+
+
+# So many features of a view are enough for a start.
+START_FEATURES = 40
+
+
+def _some(features: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Features from all over the board: any regular choice may lie on one line."""
+    if len(features) <= START_FEATURES:
+        return features
+    return np.random.default_rng(0).permutation(features)[:START_FEATURES]
 
 
 def prior_sigmas(model: BundleModel, camera_size: tuple[int, int], projector_size: tuple[int, int]) -> Floats:
@@ -482,7 +495,7 @@ class _Sums:
     """Products of weighted rows, as far as they can be summed before it is known which views count."""
 
     of_view: Floats
-    """(views, 36, 36), of LENSES, POSE, BEND and RESIDUAL."""
+    """(views, 31, 31) or (views, 36, 36), of LENSES, POSE, RESIDUAL, and BEND with the board's shape."""
     of_place: Floats
     """(features, views, 3, 39), of a feature's place with everything; none where the board is taken as drawn."""
 
@@ -490,8 +503,8 @@ class _Sums:
 def _sums(p: _Problem, rows: _Rows, weight: Floats) -> _Sums:
     weighted = (rows.design * np.sqrt(weight)[..., None, None]).reshape(len(weight), 4, -1)
     edges = np.searchsorted(p.f.view, np.arange(p.views + 1))
-    plain = weighted[..., : RESIDUAL + 1]
-    views = (plain[low:high].reshape(-1, RESIDUAL + 1) for low, high in pairwise(edges))
+    plain = weighted[..., : BEND.start if p.board_sigma is None else BEND.stop]
+    views = (plain[low:high].reshape(-1, plain.shape[2]) for low, high in pairwise(edges))
     of_view = np.array([_product(each, each) for each in views])
     of_place = np.zeros((0 if p.board_sigma is None else len(p.centre.shape), p.views, 3, PLACE.stop))
     if p.board_sigma is not None:
@@ -599,7 +612,7 @@ def solve(f: Features, first: BundleModel, prior_sigma: Floats, *, k3: bool = Fa
         GeometryError: the start is no start.
     """
     p = _problem(f, first, prior_sigma, np.array([i for i in range(24) if k3 or i not in K3]), None)
-    model, rows = first, _rows_at(first, f)
+    model, rows = first, _rows_at(first, p)
     scales = _scales(p, rows)
     for robust in (_huber,) if rough else (_tukey, _tukey, _tukey):
         before = scales
@@ -610,8 +623,8 @@ def solve(f: Features, first: BundleModel, prior_sigma: Floats, *, k3: bool = Fa
     return _finish(p, model, rows, _precision(p, model, rows, scales), rough)
 
 
-def _rows_at(first: BundleModel, f: Features) -> _Rows:
-    rows = rows_of(first, f)
+def _rows_at(first: BundleModel, p: _Problem) -> _Rows:
+    rows = rows_of(first, p.f, shape=p.board_sigma is not None)
     if rows is None:
         raise GeometryError("the start puts a board behind the scanner")
     return rows
@@ -661,7 +674,7 @@ def _minimise(
             except np.linalg.LinAlgError:
                 finite = False
             trial = p.moved(model, core, blocks) if finite else model
-            trial_rows = rows_of(trial, p.f) if finite else None
+            trial_rows = rows_of(trial, p.f, shape=p.board_sigma is not None) if finite else None
             if trial_rows is not None:
                 trial_weight, trial_cost = weigh(trial_rows)
                 trial_cost += p.prior_cost(trial)
@@ -861,7 +874,7 @@ def solve_with_board(f: Features, solved: Solution) -> Solution:
         solved: with the board as drawn; a rough one does.
     """
     p = _problem(f, solved.model, solved.prior_sigma, solved.free, (FIRST_MM, FIRST_MM))
-    model, rows = solved.model, _rows_at(solved.model, f)
+    model, rows = solved.model, _rows_at(solved.model, p)
     scales = _scales(p, rows)
     for _ in range(MOST_ROUNDS):
         model, rows = _minimise(p, model, rows, scales, _tukey)

@@ -156,8 +156,8 @@ def best_pose(
         score: of a (24, 24) covariance.
     """
     model, free = solution.model, solution.free
-    # Some forty of the features tell.
-    board = board_mm[:: max(1, len(board_mm) // 40)]
+    # Some twenty of the features tell.
+    board = board_mm[:: max(1, len(board_mm) // 20)]
     tried = [
         (volume.points[place] * 0.5 + volume.points[13] * 0.5, tilt, around)
         for place in (13, 4, 22, 9, 17, 11, 15)
@@ -182,7 +182,7 @@ def best_pose(
         relative_sigma=np.ones(len(none)),
         number=np.tile(np.arange(each), count),
     )
-    rows = rows_of(replace(model, turns=turns, shifts=shifts, shape=np.zeros_like(board)), features)
+    rows = rows_of(replace(model, turns=turns, shifts=shifts, shape=np.zeros_like(board)), features, shape=False)
     if rows is None:
         return None
     # Nothing was "seen": the residuals are the projections themselves.

@@ -253,7 +253,7 @@ def nominal_covariance(scanner: Scanner, distance_mm: float) -> Floats:
     )
     size_c, size_p = ((lens.width, lens.height) for lens in (scanner.camera, scanner.projector))
     information = np.diag(prior_sigmas(model, size_c, size_p) ** -2.0)
-    rows = rows_of(model, features)
+    rows = rows_of(model, features, shape=False)
     if rows is not None:
         # Nothing was "seen": the residuals are the projections themselves.
         pixels = rows.residuals

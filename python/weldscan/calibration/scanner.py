@@ -50,6 +50,8 @@ MISSING_SHARE = 0.1
 REJECTED_SHARE = 0.05
 LEAST_COVERAGE = 0.5
 PARALLEL_DEG = 10.0
+# So much noise makes of a flat board whose shape is solved for.
+FLAT_MM = 0.003
 # Above this the poses contradict each other by more than chance does.
 CONTRADICTION = 3.0
 # `inspect` bars PASS where less of a wall lies inside the hull of the calibrated pixels.
@@ -654,7 +656,7 @@ def _warnings(
         lost = float((~solved.used[counted, column]).mean())
         if lost > REJECTED_SHARE:
             out.append(f"{lost:.0%} of the {name}'s features were rejected as outliers")
-    if found.board_sigma_mm is not None:
+    if found.board_sigma_mm is not None and max(found.board_sigma_mm) > FLAT_MM:
         inside, outside = found.board_sigma_mm
         out.append(
             f"the board departs from its drawing by {inside:.3f} mm in its plane and {outside:.3f} mm out of it (one "

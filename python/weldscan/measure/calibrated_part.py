@@ -59,6 +59,15 @@ def held_against_calibration(
     return tuple(found)
 
 
+def mostly_outside(points_mm: Floats, outside_mm: Floats) -> str:
+    """What to add to the reason why a shot could not be used; empty where its points were hardly masked."""
+    inside, outside = int(np.isfinite(points_mm[..., 2]).sum()), len(outside_mm)
+    share = outside / max(inside + outside, 1)
+    if share <= 1 - LEAST_INSIDE:
+        return ""
+    return f" ({share:.0%} of its points lie where the scanner is not calibrated, and do not count)"
+
+
 def about_region(spec: ScannerSpec) -> Finding | None:
     """A note where a calibrated scanner's file does not say where it was calibrated."""
     if spec.covariance is None or spec.hull is not None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from weldscan._weldcore import WeldShot, WeldStep, __version__, measure_step, place_shots, segment_weld
 from weldscan.calibration.hand_eye import point_uncertainty_mm, pose_sigma
 from weldscan.errors import GeometryError, InputError
-from weldscan.measure.calibrated_part import about_region, held_against_calibration
+from weldscan.measure.calibrated_part import about_region, held_against_calibration, mostly_outside
 from weldscan.measure.calibration_margin import CalibrationMargin, Unevenness, calibration_above, calibration_margin
 from weldscan.measure.journal import Journal, SetPhaseError, ShotReading, took
 from weldscan.measure.observable_terms import seam_terms
@@ -210,7 +210,8 @@ class _Run:
         if segmented is not None:
             refused = other_part(scan.points_mm, part, axis, segmented)
         if segmented is None or refused is not None:
-            return None, noticed + Journal(left_out=((shot.name, str(refused)),))
+            why = f"{refused}{mostly_outside(scan.points_mm, scan.outside_mm)}"
+            return None, noticed + Journal(left_out=((shot.name, why),))
         said = held_against_calibration(
             shot.name, self.session.scanner, segmented, scan.points_mm, scan.outside_mm, part.wall_thickness
         )

@@ -23,7 +23,8 @@ fn outside_calibration<'py>(
     projector_px: &Bound<'py, PyAny>,
 ) -> PyResult<Bound<'py, PyArray2<bool>>> {
     let shape = points_mm.shape().to_vec();
-    let strided = |_| raise(py, &Error::Shape { what: "points_mm", expected: "contiguous".into(), got: "strided".into() });
+    let strided =
+        |_| raise(py, &Error::Shape { what: "points_mm", expected: "contiguous".into(), got: "strided".into() });
     let points = points_mm.as_slice().map_err(strided)?.as_chunks::<3>().0;
     if shape[2] != 3 {
         let got = format!("shape {shape:?}");

@@ -490,6 +490,12 @@ def _product(left: Floats, right: Floats) -> Floats:
     return np.asarray(out)
 
 
+def _in_strips(left: Floats, right: Floats) -> Floats:
+    """The product of (i, n) and (n, j), strip by strip of the left one's rows, for the same reason."""
+    strip = max(1, ONE_THREAD // right.size)
+    return np.concatenate([left[k : k + strip] @ right for k in range(0, len(left), strip)])
+
+
 @dataclass(frozen=True, eq=False)
 class _Sums:
     """Products of weighted rows, as far as they can be summed before it is known which views count."""
@@ -856,7 +862,7 @@ def repeats(f: Features, solved: Solution) -> bool:
     for axes in ([0, 1], [2]):
         count, own = len(normal.c), len(axes)
         b = normal.b[:, axes][..., core].reshape(count * own, -1)
-        information = -_product(inverse @ b.T, b.T)
+        information = -_in_strips(_in_strips(b, inverse), b.T)
         each = np.arange(count)
         information.reshape(count, own, count, own)[each, :, each, :] += normal.c[:, axes][:, :, axes]
         gradient = normal.block_gradient[:, axes].ravel()

@@ -18,7 +18,7 @@ RADIUS_MM = 109.5
 HALF_ARC_RAD = math.radians(27.0)
 """So much of a pipe is measured from one place."""
 HALF_CAP_MM, WALL_MM = 8.0, 40.0
-STEPS_AROUND, STEPS_ALONG = 37, 17
+STEPS_AROUND, STEPS_ALONG = 25, 9
 # The step is asked for where both walls are seen on both sides of it.
 ASKED_RAD = math.radians(20.0)
 # A wall of fewer points is not in view.

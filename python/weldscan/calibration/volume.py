@@ -116,10 +116,11 @@ def uncertainties(model: BundleModel, volume: Volume, covariance: Floats, axis: 
     scanner (the hand-eye) takes a common motion of all points up. What is left of it is the shape.
     """
     jacobian = point_jacobian(model, volume.points, axis).reshape(-1, 24)
-    whole = jacobian @ covariance @ jacobian.T
-    free = rigid_part(volume.points)
-    shape = free @ whole @ free
-    return tuple(np.sqrt(np.maximum(np.diag(c), 0)).reshape(-1, 3) for c in (whole, shape))  # type: ignore[return-value]
+    whole, shape = (
+        np.sqrt(np.maximum(((each @ covariance) * each).sum(axis=1), 0)).reshape(-1, 3)
+        for each in (jacobian, rigid_part(volume.points) @ jacobian)
+    )
+    return np.asarray(whole), np.asarray(shape)
 
 
 @dataclass(frozen=True, eq=False)

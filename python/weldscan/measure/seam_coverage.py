@@ -231,6 +231,8 @@ def _field(view: PartView, scanner: Scanner) -> tuple[NDArray[np.bool_], Floats]
             ):
                 size = np.array([lens.width, lens.height]) - 1 - BORDER_PX
                 inside &= ((pixels >= BORDER_PX) & (pixels <= size)).all(axis=1)
+            if view.hull is not None:
+                inside &= view.hull.holds(scanner.camera.project(points), scanner.project_to_projector(points))
             for eye in (np.zeros(3), np.asarray(scanner.camera_from_projector)[:3, 3]):
                 ray = eye - points
                 cosine = np.einsum("ij,ij->i", ray, normal) / np.linalg.norm(ray, axis=1)

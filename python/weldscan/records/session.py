@@ -165,7 +165,7 @@ class Session(Model):
     schema_: Literal["weldscan-session/1"] = Field(alias="schema")
     name: Annotated[str, Field(min_length=1, max_length=200)]
     scanner: ScannerSpec
-    """In the file also the name of a `weldscan-scanner/1` document in the session's folder."""
+    """In the file also the name of a `weldscan-scanner/2` document in the session's folder."""
     fringes: Annotated[tuple[FringeSet, ...], Field(min_length=1, max_length=100)]
     artefact: ArtefactSpec | None = None
     hand_eye: HandEyeSpec | Annotated[str, Field(min_length=1, max_length=200)] | None = None

@@ -10,6 +10,7 @@ use crate::fringes::Reason;
 use crate::ground::threads;
 use crate::ground::transform::Vec3;
 use crate::scanner::Lens;
+use crate::scanner::calibrated_region::OUTSIDE_CALIBRATION;
 
 /// The fates, in the order of `weldscan.result.FATES`: wall, transition, cap, gated, off line, dark, saturated, order in
 /// doubt, two paths, outside the calibration, hidden, other.
@@ -48,11 +49,12 @@ fn of_reason(reason: u8) -> usize {
         r if r == Reason::Saturated as u8 => 6,
         // Samples that are no sinusoid have no fringe order either.
         r if r == Reason::OrderInDoubt as u8 || r == Reason::NoFit as u8 => 7,
+        OUTSIDE_CALIBRATION => 9,
         _ => 5,
     }
 }
 
-/// Counts the pixels of a segmented shot; `reasons` as decoding gave them, `camera` with the shot's width and height.
+/// Counts the pixels of a segmented shot; `reasons` as decoding gave them, or [`OUTSIDE_CALIBRATION`], `camera` with the shot's width and height.
 ///
 /// # Errors
 /// [`Error::Shape`] where the arrays are not those of one image of the camera.
@@ -124,12 +126,12 @@ mod tests {
     fn every_pixel_of_the_seam_is_counted_once() {
         let mut points = EXAMPLE.points();
         let mut reasons = vec![0_u8; points.len()];
-        // A band across the whole view is dark, another saturated.
-        for row in 100..120 {
+        // A band across the whole view is dark, another saturated, a third outside the calibration.
+        for row in 100..130 {
             for column in 0..COLUMNS {
                 let i = row * COLUMNS + column;
                 points[i] = [f64::NAN; 3];
-                reasons[i] = if row < 110 { Reason::Dark as u8 } else { Reason::Saturated as u8 };
+                reasons[i] = [Reason::Dark as u8, Reason::Saturated as u8, OUTSIDE_CALIBRATION][row / 10 - 10];
             }
         }
         let shot = segment(&points, COLUMNS, &EXAMPLE.nominal()).unwrap();
@@ -140,7 +142,7 @@ mod tests {
         let valid = points.iter().filter(|p| p[0].is_finite()).count() as u32;
         assert_eq!([0, 1, 2, 3, 4, 11].map(total).iter().sum::<u32>(), valid);
         // The rays of nearly all lost pixels meet the pipe.
-        for (fate, lost) in [(5, 10 * COLUMNS), (6, 10 * COLUMNS)] {
+        for (fate, lost) in [(5, 10 * COLUMNS), (6, 10 * COLUMNS), (9, 10 * COLUMNS)] {
             assert!(f64::from(total(fate)) > 0.9 * lost as f64, "{fate} {} {lost}", total(fate));
         }
         assert!(total(0) > 8 * valid / 10 && total(2) > 0 && total(3) == 0);

@@ -288,6 +288,17 @@ def _say(found: ScannerCalibration, out: Path, page: Path) -> None:
         f"        u of a point (k = 1, shape of the volume): {size[0]:.3f} mm in the middle, "
         f"{size[1]:.3f} mm {worst.name}"
     )
+    weld = found.weld
+    if weld.u_mm < float("inf"):
+        print(
+            f"        u of the step of a pipe of 219 mm at {weld.distance_mm:.0f} mm (k = 1, the calibration's part, "
+            f"propagated): {weld.u_mm:.3f} mm; {weld.inside:.0%} of its walls lie where the boards were"
+        )
+    if found.jackknife_ratio is not None:
+        print(
+            f"        leaving out poses: {found.jackknife_ratio:.2f} of what noise explains"
+            + ("; every uncertainty was scaled by it" if found.jackknife_ratio > 1 else "")
+        )
     for name, reason in found.left_out:
         print(f"        left out {name}: {reason}")
     for warning in found.warnings:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from weldscan.errors import InputError
+from weldscan.errors import InputError, Unreadable
 from weldscan.records.fields import read_model
 from weldscan.records.files import read_json, to_json, write_file
 from weldscan.records.hand_eye import HandEyeSpec
@@ -73,6 +73,8 @@ def check_plan(path: Path) -> None:
         return
     try:
         ours = str(read_json(path)["name"]).endswith(NAME)
+    except Unreadable:
+        raise
     except (InputError, KeyError, TypeError):
         ours = False
     # A session's own document has its images beside it.

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from weldscan._weldcore import Lens, Scanner
-from weldscan.errors import InputError
+from weldscan.errors import InputError, Unreadable
 from weldscan.records.fields import (
     CameraMatrix,
     Day,
@@ -117,6 +117,8 @@ def write_scanner(path: str | os.PathLike[str], found: ScannerCalibration) -> Sc
     if path.exists():
         try:
             read_scanner(path)
+        except Unreadable:
+            raise
         except InputError as error:
             raise InputError(
                 f"{path}: exists and is no scanner's calibration: remove it or name another ({error})"

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,12 +24,13 @@ from weldscan.devices.projectors.patterns import flat_pattern, fringe_patterns
 from weldscan.devices.robots import Robot, StampedPose, distance, wait_until_still
 from weldscan.errors import DeviceError, InputError, WeldscanError
 from weldscan.pose import KukaPose
+from weldscan.records.files import own_file
 from weldscan.records.hand_eye import read_hand_eye
 from weldscan.records.plan import read_plan
 from weldscan.records.session import FlangePose, Session, ShotSpec
 from weldscan.station.capture import Quality, capture_stack, judge, set_exposure
 from weldscan.station.cell import CellConfig, check
-from weldscan.station.store import LOG, ShotStore
+from weldscan.station.store import LOG, SetAside, ShotStore
 
 Tell = Callable[[int, int, str], None]
 Operator = Callable[[ShotSpec], None]
@@ -68,6 +70,8 @@ class ScanResult:
     planned: int
     rejected: tuple[tuple[str, str], ...]
     """Shots that were tried and not kept, with the reason."""
+    set_aside: tuple[SetAside, ...] = ()
+    """Shots that were there and damaged: why, and where they are now."""
 
 
 class Rejected(WeldscanError):
@@ -80,6 +84,7 @@ def scan(
     resume: bool = False,
     tell: Tell = lambda done, of, what: None,
     operator: Operator | None = None,
+    retake: bool = False,
 ) -> ScanResult:
     """Scan what the plan says and is not there yet.
 
@@ -89,17 +94,20 @@ def scan(
         resume: go on with that.
         tell: called with (whole shots, planned shots, what is being done).
         operator: called before a shot when weldscan may not move the robot; returns when the robot is at its pose.
+        retake: set aside more than one damaged shot, too.
 
     Raises:
-        InputError: configuration, plan or folder. DeviceError: a device failed; the shots so far are kept.
+        InputError: configuration, plan or folder. Unreadable: a shot that is there; nothing was touched.
+        DeviceError: a device failed; the shots so far are kept.
     """
     settings, plan = read_settings(cell)
     for kind in ("projector", "camera", *(["robot"] if plan.has_robot else [])):
         cell.settings(kind)  # a wrong configuration is told before anything is written
-    with ShotStore(out, plan, resume) as store, _log_to(out / LOG), ExitStack() as devices:
+    with ShotStore(out, plan, resume, retake) as store, _log_to(out / LOG), ExitStack() as devices:
         log.info("scan of %d shots, %d are there", len(plan.shots), len(store.whole))
-        for name, reason in store.redone.items():
-            log.warning("%s is taken again: %s", name, reason)
+        for each in store.set_aside:
+            log.warning("%s is taken again: %s; it was moved to %s", each.shot, each.reason, each.folder)
+            tell(len(store.whole), len(plan.shots), f"set aside {each.shot} as {each.folder}: {each.reason}")
         if not store.missing:
             return ScanResult(out, len(store.whole), len(plan.shots), ())
         try:
@@ -151,7 +159,9 @@ class _Scan:
             else:
                 log.info("kept %s", shot.name)
                 self._say(f"kept {shot.name}")
-        return ScanResult(self.store.folder, len(self.store.whole), len(self.plan.shots), tuple(rejected))
+        return ScanResult(
+            self.store.folder, len(self.store.whole), len(self.plan.shots), tuple(rejected), self.store.set_aside
+        )
 
     def _say(self, what: str) -> None:
         self.tell(len(self.store.whole), len(self.plan.shots), what)
@@ -274,6 +284,9 @@ def read_settings(cell: CellConfig) -> tuple[ScanSettings, Session]:
 
 
 class _LogFile(logging.FileHandler):
+    def _open(self) -> TextIOWrapper:
+        return TextIOWrapper(own_file(Path(self.baseFilename)), encoding="utf-8")
+
     def handleError(self, record: logging.LogRecord) -> None:
         """A log that cannot be written, on a full disk, says nothing of its own."""
 

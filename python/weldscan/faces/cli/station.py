@@ -236,6 +236,9 @@ def scan(
     ] = None,
     config: Config = CELL,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a scan that was stopped.")] = False,
+    retake: Annotated[
+        bool, typer.Option("--retake", help="With --resume: set aside more than one damaged shot, and take them again.")
+    ] = False,
     example_config: Annotated[
         Path | None,
         typer.Option(
@@ -262,12 +265,14 @@ def scan(
     how = f"weldscan scan --config {config} --out {out} --resume"
     try:
         with shown_progress() as tell:
-            result = run(read_cell(config), out, resume, tell, _ask_the_operator)
+            result = run(read_cell(config), out, resume, tell, _ask_the_operator, retake)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"stopped; what was kept is whole. To go on: {how}") from None
     complete = result.whole >= result.planned
     with terminal.answer(0 if complete else NOT_MEASURED):
         print(f"{result.whole} of {result.planned} shots in {out}")
+        for each in result.set_aside:
+            print(f"       set aside {each.shot} as {each.folder}: {each.reason}")
         for name, reason in result.rejected:
             print(f"       rejected {name}: {reason}")
         print(f"       next: weldscan inspect {out}" if complete else f"       to go on: {how}")

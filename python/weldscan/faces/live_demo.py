@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 from weldscan.errors import InputError, NotMeasured
 from weldscan.pose import KukaPose
-from weldscan.records.files import write_file
+from weldscan.records.files import write_files
 from weldscan.simulated import DEFAULT, Cell, session_document
 from weldscan.simulated.controllers import Arm
 from weldscan.simulated.controllers.kvp import KvpController
@@ -113,6 +113,5 @@ def write_example(folder: Path, cell: Cell = DEFAULT) -> str:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror or error}") from None
-    for file, content in files.items():
-        write_file(file, content)
+    write_files(files)
     return "\n".join(line.removeprefix("# ") for line in text.splitlines()[:7])

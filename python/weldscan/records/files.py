@@ -219,24 +219,48 @@ CANNOT_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF)
 CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
 
 
+def check_file(path: Path) -> None:
+    """Says early that a file cannot be written, before anything is measured for it."""
+    if path.is_dir():
+        raise InputError(f"{path}: cannot be written: {os.strerror(errno.EISDIR)}")
+    _check_folder(path, path.absolute().parent)
+
+
+def _check_folder(path: Path, folder: Path | None) -> None:
+    """Says that what is to go into a folder cannot be written there."""
+    if folder is None or not folder.is_dir():
+        raise InputError(f"{path}: cannot be written: {folder} is not a folder")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"{path}: cannot be written: {folder} is not a folder that may be written to")
+
+
 def write_file(path: Path, content: str | bytes) -> None:
     """Gives a file its contents; whoever looks sees the old ones or the new ones, whole, also after a power cut.
 
     Raises:
         InputError: it cannot be written; what was there is untouched.
     """
-    partial = _sibling(path, "partial")
+    write_files({path: content})
+
+
+def write_files(contents: Mapping[Path, str | bytes]) -> None:
+    """As `write_file`, for files that belong together: none gets its name before the disk has all of them."""
+    partials = {path: _sibling(path, "partial") for path in contents}
+    path = next(iter(partials))
     try:
-        remove_unfinished(path.parent, path.name)
-        write_synced(partial, content)
-        while not _replaced(partial, path):  # it was taken for a dead one's
-            write_synced(partial, content)
-        sync_folder(path.parent)
+        for path, partial in partials.items():
+            remove_unfinished(path.parent, path.name)
+            write_synced(partial, contents[path])
+        for path, partial in partials.items():
+            while not _replaced(partial, path):  # it was taken for a dead one's
+                write_synced(partial, contents[path])
+            sync_folder(path.parent)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {_reason(error)}") from None
     finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
+        for partial in partials.values():
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
 
 
 def _replaced(partial: Path, path: Path) -> bool:
@@ -286,9 +310,7 @@ class whole_folder:
             raise InputError(f"{path}: exists and is not a folder")
         if path.is_dir() and any(path.iterdir()) and not replaces(path):
             raise InputError(f"{path}: exists and holds something else; name another folder or remove it")
-        above = next((parent for parent in path.absolute().parents if parent.exists()), None)
-        if above is None or not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-            raise InputError(f"{path}: cannot be written: {above} is not a folder that may be written to")
+        _check_folder(path, next((parent for parent in path.absolute().parents if parent.exists()), None))
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         try:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from weldscan.errors import InputError, Unreadable
 from weldscan.records.fields import read_model
-from weldscan.records.files import read_json, to_json, write_file
+from weldscan.records.files import check_file, read_json, to_json, write_file
 from weldscan.records.hand_eye import HandEyeSpec
 from weldscan.records.scanner import ScannerSpec, with_scanner
 from weldscan.records.session import ArtefactSpec, FringeSet, RobotSpec, Session, ShotSpec, parse_session
@@ -67,8 +67,7 @@ def read_source(path: str | os.PathLike[str]) -> PlanSource:
 
 def check_plan(path: Path) -> None:
     """Says early what would be in the way of a plan: only an earlier plan for a hand-eye calibration is replaced."""
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path}: cannot be written: {path.absolute().parent} is not a folder")
+    check_file(path)
     if not path.exists():
         return
     try:

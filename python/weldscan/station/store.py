@@ -15,6 +15,7 @@ import hashlib
 import itertools
 import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -141,10 +142,10 @@ class ShotStore:
         }
         with whole_folder(self._shots / shot.name) as partial:
             files = {}
-            for name, image in images.items():
-                data = encode_png(image)
-                write_synced(partial / name, data)
-                files[name] = hashlib.sha256(data).hexdigest()
+            with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+                for name, data in zip(images, pool.map(encode_png, images.values()), strict=True):
+                    write_synced(partial / name, data)
+                    files[name] = hashlib.sha256(data).hexdigest()
             manifest = ShotManifest(schema="weldscan-shot/1", shot=shot, files=files, record=record)
             text = manifest.model_dump(mode="json", exclude_none=True, by_alias=True)
             write_synced(partial / SHOT, to_json(text))

@@ -18,8 +18,9 @@ from weldscan.errors import Unreadable
 from weldscan.records import files
 from weldscan.records.files import remove_unfinished, whole_folder, write_file
 from weldscan.records.shot import NotUnderstood, faults
+from weldscan.station import scan as scan_module
 from weldscan.station import store
-from weldscan.station.cell import read_cell
+from weldscan.station.cell import CellConfig, read_cell
 from weldscan.station.scan import scan
 
 
@@ -221,6 +222,68 @@ def test_an_earlier_result_that_was_just_being_replaced_comes_back(tmp_path):
     assert (tmp_path / ".file.0123abcd.partial").exists()
     remove_unfinished(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"out", ".out.89abcdef.partial2", ".out.01234567.partial"}
+
+
+def test_files_that_belong_together_appear_together(tmp_path, monkeypatch):
+    """An example's configuration without its plan would stand in the way of the next try."""
+    from weldscan.faces.live_demo import write_example
+
+    write, left = files.write_synced, [1]
+
+    def full(path, *content):
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(path, *content)
+
+    with monkeypatch.context() as moment:
+        moment.setattr(files, "write_synced", full)
+        with pytest.raises(InputError, match=r"plan\.json: cannot be written: No space left"):
+            write_example(tmp_path / "cell")
+    assert list((tmp_path / "cell").iterdir()) == []
+    write_example(tmp_path / "cell")
+
+
+def test_a_log_on_a_full_disk_says_nothing_of_its_own(cell, monkeypatch):
+    class Full:
+        """A file whose disk is full."""
+
+        def __getattr__(self, name):
+            if name in ("write", "flush", "close"):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            raise AttributeError(name)
+
+    shutil.rmtree(cell.out / "shots/part-1")
+    monkeypatch.setattr(scan_module._LogFile, "_open", lambda _: Full())
+    assert cell.scan(resume=True).whole == 3
+
+
+@pytest.mark.parametrize("command", ["preview", "check", "ramp", "hand-eye", "response", "plan", "scanner"])
+def test_a_place_that_cannot_be_written_to_is_told_before_anything_is_measured(cell, tmp_path, monkeypatch, command):
+    from typer.testing import CliRunner
+
+    from weldscan.faces.cli.app import app
+
+    measured, place = [], tmp_path / "place"
+    place.mkdir()
+    real = os.access
+    monkeypatch.setattr(os, "access", lambda path, *how: Path(path) != place and real(path, *how))
+    monkeypatch.setattr(CellConfig, "open", lambda *_, **__: measured.append("opened"))
+    for module in ("measure.session_hand_eye.calibrate", "calibration.response.response_of_folder"):
+        monkeypatch.setattr(f"weldscan.{module}", lambda *_, **__: measured.append("solved"))
+    monkeypatch.setattr("weldscan.calibration.scanner.calibrate_scanner", lambda *_, **__: measured.append("solved"))
+    words = {
+        "preview": ["camera", "preview", "--config", cell.path, "--count", 1, "--out", place / "x.png"],
+        "check": ["devices", "check", "--config", cell.path, "--out", place / "x.json"],
+        "ramp": ["devices", "check", "--config", cell.path, "--out", tmp_path / "x.json", "--ramp", place],
+        "hand-eye": ["calibrate", "hand-eye", cell.out, "--out", place / "x.json", "--page", tmp_path / "x.html"],
+        "response": ["calibrate", "response", cell.out, "--out", place / "x.json"],
+        "plan": ["calibrate", "plan", cell.out, "--out", place / "x.json", "--page", tmp_path / "x.html"],
+        "scanner": ["calibrate", "scanner", cell.out, "--out", place / "x.json"],
+    }[command]
+    done = CliRunner().invoke(app, list(map(str, words)))
+    assert isinstance(done.exception, InputError) and "not a folder that may be written to" in str(done.exception)
+    assert measured == []
 
 
 # --- beside the robot's motion ----------------------------------------------------------------------------------------

@@ -72,7 +72,9 @@ def record_live(
     plan = session_document(cell)
     arm = Arm(KukaPose(*plan["shots"][0]["flange_pose"].values()))
     arm.speed_mm_s, arm.turn_speed_deg_s = SPEED_MM_S, TURN_SPEED_DEG_S
-    with KvpController(arm) as controller, TemporaryDirectory() as scratch:
+    # Beside the session, so that what a killed demo leaves is in its own folder.
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with KvpController(arm) as controller, TemporaryDirectory(prefix=".plan-", dir=folder.parent) as scratch:
         path = Path(scratch) / "plan.json"
         path.write_text(json.dumps(plan), encoding="utf-8")
         link = {"link": "kvp", "port": controller.port}

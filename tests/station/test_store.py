@@ -267,7 +267,9 @@ def test_a_place_that_cannot_be_written_to_is_told_before_anything_is_measured(c
     measured, place = [], tmp_path / "place"
     place.mkdir()
     real = os.access
-    monkeypatch.setattr(os, "access", lambda path, *how: Path(path) != place and real(path, *how))
+    monkeypatch.setattr(
+        os, "access", lambda path, mode, **how: not (Path(path) == place and mode & os.W_OK) and real(path, mode, **how)
+    )
     monkeypatch.setattr(CellConfig, "open", lambda *_, **__: measured.append("opened"))
     for module in ("measure.session_hand_eye.calibrate", "calibration.response.response_of_folder"):
         monkeypatch.setattr(f"weldscan.{module}", lambda *_, **__: measured.append("solved"))

@@ -169,7 +169,11 @@ def decode(
     phase_error: Literal["auto"] | Sequence[Sequence[float] | None] | None = None,
 ) -> PhaseMap: ...
 def capture_quality(
-    exposures: Sequence[Sequence[NDArray[Any]]], first: int, steps: int, least_modulation: float
+    exposures: Sequence[Sequence[NDArray[Any]]],
+    first: int,
+    steps: int,
+    least_modulation: float,
+    full_scale: int | None = None,
 ) -> tuple[float, float, float, float]: ...
 def saturation_level(images: Sequence[NDArray[Any]] | NDArray[Any]) -> tuple[float, float, bool]: ...
 

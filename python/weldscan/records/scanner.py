@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from weldscan._weldcore import Lens, Scanner
-from weldscan.errors import InputError
+from weldscan.errors import InputError, Unreadable
 from weldscan.records.fields import (
     CameraMatrix,
     Day,
@@ -140,6 +140,8 @@ def write_scanner(path: str | os.PathLike[str], found: ScannerCalibration) -> Sc
     if path.exists():
         try:
             read_scanner(path)
+        except Unreadable:
+            raise
         except InputError as error:
             raise InputError(
                 f"{path}: exists and is no scanner's calibration: remove it or name another ({error})"

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from weldscan import KukaPose
 from weldscan.devices.robots import distance
 from weldscan.simulated.controllers import HOME, HOME_JOINTS, Arm, OutOfReach
-from weldscan.simulated.controllers.kinematics import ArmGeometry
+from weldscan.devices.robots.kinematics import ArmGeometry
 
 ARM = ArmGeometry()
 MM = 1e-4

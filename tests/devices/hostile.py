@@ -14,7 +14,8 @@ import time
 from collections.abc import Callable, Iterator
 
 from weldscan import DeviceError, KukaPose
-from weldscan.devices.robots import Robot, distance
+from weldscan.devices.robots import Robot
+from weldscan.devices.robots.plausible import distance
 from weldscan.simulated.controllers import Arm
 
 TRUE = KukaPose(1610.825, -148.476, 981.652, -29.008, 23.236, 74.641)
@@ -43,7 +44,8 @@ def honest(flange: KukaPose, first: int, count: int, sender: int = 0) -> list[Pa
 
 
 def interleaved(a: list[Packet], b: list[Packet]) -> list[Packet]:
-    return [packet for pair in zip(a, b, strict=True) for packet in pair]
+    """Both at once."""
+    return [packet for first, second in zip(a, b, strict=True) for packet in (first, (0.0, *second[1:]))]
 
 
 def again(packets: list[Packet], times: int, pause_s: float = 0.0) -> list[Packet]:
@@ -83,7 +85,7 @@ def rsi_streams() -> dict[str, list[Packet]]:
         "the same IPOC, another pose": [(CYCLE_S, 0, rsi_packet(FALSE, 1476))] * 120,
         "IPOC 0": [(CYCLE_S, 0, rsi_packet(FALSE, 0))] * 120,
         "late packets between": interleaved(on[:60], old),
-        "a late packet now and then": [p for i in range(60) for p in ([on[i]] + ([old[i]] if i % 10 == 9 else []))],
+        "a late packet now and then": [p for i in range(60) for p in ([on[i]] + ([(0.0, *old[i][1:])] if i % 10 == 9 else []))],
         "a second of backlog at once": [(1.0, 0, b"")] + [(0.0, 0, p) for _, _, p in honest(FALSE, 1480, 240)],
         "second sender ahead": interleaved(on[:60], honest(FALSE, 9000, 60, 1)),
         "second sender with the same IPOC": interleaved(on[:60], honest(FALSE, 1480, 60, 1)),
@@ -104,15 +106,12 @@ def wrong_rsi_poses(robot: Robot, port: int, stream: list[Packet]) -> tuple[int,
     senders = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3)]
     for sender, address in zip(senders, ("127.0.0.1", "127.0.0.1", "127.0.0.2"), strict=True):
         sender.bind((address, 0))
-    for wait_s, who, packet in honest(FALSE, 1000, 60) + honest(TRUE, 1240, 60):
-        time.sleep(wait_s)
-        senders[who].sendto(packet, ("127.0.0.1", port))
-    with contextlib.suppress(DeviceError):
-        robot.pose()
-    over = threading.Event()
+    hostile, over = threading.Event(), threading.Event()
 
     def send() -> None:
-        for wait_s, who, packet in stream:
+        for number, (wait_s, who, packet) in enumerate(honest(FALSE, 1000, 60) + honest(TRUE, 1240, 60) + stream):
+            if number == 119:
+                hostile.set()
             if wait_s:
                 time.sleep(wait_s)
             if packet:
@@ -121,6 +120,7 @@ def wrong_rsi_poses(robot: Robot, port: int, stream: list[Packet]) -> tuple[int,
 
     thread = threading.Thread(target=send)
     thread.start()
+    hostile.wait()
     believed = wrong = 0
     while not over.is_set():
         try:

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from weldscan.devices.robots import RobotSettings
 from weldscan.devices.robots.program import LAST_NUMBER, Command, ProgramRobot
-from weldscan.devices.robots.wire import LARGEST_MESSAGE, Deadline, Host, TcpTransport, cut_xml, only, parse_xml, xml_text
+from weldscan.devices.robots.wire import LARGEST_MESSAGE, Host, TcpTransport, cut_xml, only, parse_xml, xml_text
 from weldscan.errors import DeviceError, InputError
 from weldscan.pose import KukaPose, parse_number, parse_whole
 from weldscan.records.files import read_bytes
@@ -183,8 +183,3 @@ class EkiRobot(ProgramRobot):
         if any(a != -b for a, b in zip(values[:TOLD_TWICE], values[-TOLD_TWICE:], strict=True)):
             raise DeviceError("the reading is not what it is when told a second time")
         return number, [*codes, *values[:-TOLD_TWICE]]
-
-    def _withdraw(self, deadline: Deadline) -> str:
-        """Hang up, which the program sees: it brakes, and forgets what it was asked for."""
-        self._link.renew()
-        return "the connection was closed, on which the program brakes and drops the motion"

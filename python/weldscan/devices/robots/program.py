@@ -5,9 +5,10 @@ $IPO_MODE as codes, then $POS_ACT, $TOOL, $BASE, the joints, and the target as t
 how that is written.
 
 A motion takes two requests. MOVE lays a target down: the program looks whether the arm can go there, tells the target
-as it took it, and moves nothing. GO with the same number, within two seconds by the controller's own clock, sets off.
-So a request that lay somewhere - in a FIFO, behind a stopped program, in a line's buffer - never moves anything: whoever
-asked has to be there, and to have read the very target back.
+as it took it, and moves nothing. GO with the same number, within two seconds by the controller's own clock, sets off;
+while the arm moves, a BEAT with it every half second says that the motion is still wanted. So a request that lay
+somewhere - in a FIFO, behind a stopped program, in a line's buffer - never moves anything: whoever asked has to be
+there, and to have read the very target back. Two seconds after he is gone, or with any other request, the arm brakes.
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ class Command(IntEnum):
     POSE = 1
     MOVE = 2
     GO = 3
+    BEAT = 4
+    """Never answered."""
 
 
 class Status(IntEnum):
@@ -93,18 +96,32 @@ class ProgramRobot(StreamRobot):
         off_mm, off_deg = distance(taken.target, target)
         if off_mm > SINGLE_MM or off_deg > SINGLE_DEG:
             raise DeviceError(f"{self.name}: the controller took another target: {taken.target}")
-        gone = self._ask(number, Command.GO, NOWHERE, Deadline(max(give_up_s - time.monotonic(), 1e-3)))
+        end = Deadline(max(give_up_s - time.monotonic(), 1e-3))
+        gone = self._ask(number, Command.GO, NOWHERE, end, beat=self._request(number, Command.BEAT, NOWHERE))
         if gone.status != Status.DONE:
             raise DeviceError(f"{self.name}: not moved: {_meaning(gone.status)}")
 
-    def _ask(self, number: int, command: Command, target: KukaPose, deadline: Deadline | None = None) -> Reply:
+    def _withdraw(self, deadline: Deadline) -> str:
+        """Hang up, and let the next question be another: the program brakes, and forgets what it was asked for."""
+        self._link.renew()
+        return "the motion is called back"
+
+    def _ask(
+        self,
+        number: int,
+        command: Command,
+        target: KukaPose,
+        deadline: Deadline | None = None,
+        beat: bytes | None = None,
+    ) -> Reply:
         def read(message: bytes) -> tuple[int, Sequence[float]]:
             replied, values = self._reply(message)
             if replied != number:
                 raise DeviceError(f"reply {replied} to request {number}")
             return replied, values
 
-        answer = self._link.ask(self._request(number, command, target), read, command is Command.POSE, deadline)
+        request = self._request(number, command, target)
+        answer = self._link.ask(request, read, command is Command.POSE, deadline, beat)
         _, values = answer.value
         status, mode, interpolation = (int(value) for value in values[:3])
         reading = Reading(

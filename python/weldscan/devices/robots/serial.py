@@ -20,7 +20,7 @@ from pydantic import Field
 
 from weldscan.devices.robots import RobotSettings
 from weldscan.devices.robots.program import LAST_NUMBER, REPLY_NUMBERS, Command, ProgramRobot
-from weldscan.devices.robots.wire import ConnectionLost, Deadline, TcpTransport, Transport
+from weldscan.devices.robots.wire import ConnectionLost, TcpTransport, Transport
 from weldscan.errors import DeviceError, DeviceTimeout, InputError
 from weldscan.pose import KukaPose, parse_number, parse_whole
 
@@ -170,11 +170,3 @@ class SerialRobot(ProgramRobot):
         if len(texts) != REPLY_NUMBERS:
             raise DeviceError(f"{len(texts)} numbers for {REPLY_NUMBERS}")
         return number, [*map(parse_whole, texts[:3]), *map(parse_number, texts[3:])]
-
-    def _withdraw(self, deadline: Deadline) -> str:
-        """Nothing but another question can be said over a line: it drops what waits for its GO, and no motion."""
-        self._link.renew()
-        return (
-            "what waited is dropped, but a motion that has begun cannot be called back over a serial line: it goes on to "
-            "its end unless the enabling switch is let go"
-        )

@@ -31,6 +31,8 @@ Cut = Callable[[bytearray], bytes | None]
 
 LARGEST_MESSAGE = 65_536
 """Bytes: the largest message of any link here has about 1,000."""
+BEAT_S = 0.5
+"""Whoever waits for a motion says so this often."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
 """Back-off between attempts to reconnect: doubled from the first to the longest."""
 
@@ -255,12 +257,18 @@ class Link:
         return Deadline(self.timeout_s, self.reconnect_s)
 
     def ask(
-        self, request: bytes, read: Callable[[bytes], T], repeat: bool = True, deadline: Deadline | None = None
+        self,
+        request: bytes,
+        read: Callable[[bytes], T],
+        repeat: bool = True,
+        deadline: Deadline | None = None,
+        beat: bytes | None = None,
     ) -> Answer[T]:
         """Send the request and give what `read` makes of the one reply.
 
         `read` raises `DeviceError` or `InputError` on a reply that is not the answer. `deadline` is of the question of
-        the user that this one is a part of; without one it is a question of its own.
+        the user that this one is a part of; without one it is a question of its own. `beat` is said every half second
+        until the reply comes.
         """
         deadline = deadline or self.deadline()
         if not self._lock.acquire(timeout=max(_remaining(deadline.end_s), 1e-3)):
@@ -273,7 +281,7 @@ class Link:
                     messages = self._stream(end_s)
                     asked_s = time.monotonic()
                     messages.transport.send(request, end_s)
-                    value = read(messages.next(end_s))
+                    value = read(messages.next(end_s) if beat is None else _awaited(messages, beat, end_s))
                     self.last_used_s = time.monotonic()
                     return Answer(value, asked_s, self.last_used_s)
                 except ConnectionLost as error:
@@ -318,6 +326,16 @@ class Link:
             with contextlib.suppress(OSError):
                 self._messages.transport.close()
             self._messages = None
+
+
+def _awaited(messages: Messages, beat: bytes, deadline_s: float) -> bytes:
+    while True:
+        try:
+            return messages.next(min(time.monotonic() + BEAT_S, deadline_s))
+        except DeviceTimeout:
+            if time.monotonic() >= deadline_s:
+                raise
+            messages.transport.send(beat, deadline_s)
 
 
 _ROOT = re.compile(rb"\s*(?:<\?xml[^<>]*\?>\s*)?<([A-Za-z_][\w.-]*)")

@@ -9,13 +9,12 @@ import time
 from collections import deque
 
 from weldscan.devices.robots.eki import CARTESIAN, JOINTS, OURS, STREAM_S, EkiConfig, Element, compose, dissect
-from weldscan.devices.robots.program import Status
 from weldscan.devices.robots.wire import LARGEST_MESSAGE, Messages, TcpTransport, Transport, cut_xml, parse_xml
 from weldscan.errors import DeviceError, DeviceTimeout
 from weldscan.pose import KukaPose, parse_number
 from weldscan.simulated.controllers import LOOK_S, NULL_FRAME, Arm, Controller, LinkFault, OutOfReach, TcpController
-from weldscan.simulated.controllers.interpreter import Interpreter, Program, Resume
-from weldscan.simulated.controllers.program import Driver, Requests, codes
+from weldscan.simulated.controllers.interpreter import Interpreter, Program
+from weldscan.simulated.controllers.program import Driver, Request, Requests, codes
 
 
 class EkiController(TcpController):
@@ -39,7 +38,7 @@ class EkiController(TcpController):
         super().__init__(arm, host, port)
         self.interpreter = Interpreter(self.arm, self._program, lambda: self.running and not self._away.is_set())
         self._driver = Driver(self.arm, self.interpreter)
-        self._requests = Requests(self._driver)
+        self._requests = Requests(self._driver, self._receive, self._reply)
         if config.asks:
             self.interpreter.start()
 
@@ -89,12 +88,8 @@ class EkiController(TcpController):
         while True:
             while not self.flag1:
                 yield
-            self._requests.pending = 0
             while self.flag1:
-                while not self.flag2 and self.flag1:
-                    yield
-                if self.flag1:
-                    yield from self._request()
+                yield from self._requests.serve()
                 yield
             self._open_anew()
 
@@ -106,23 +101,23 @@ class EkiController(TcpController):
         for fifo in self.fifos.values():
             fifo.clear()
         self.flag2 = False
+        self._requests.forget()
 
-    def _request(self) -> Program:
+    def _receive(self) -> Request | None:
+        if not self.flag1:
+            return Request(0, None)  # nobody is there any more, which makes a moving arm brake
+        if not self.flag2:
+            return None
         self.flag2 = False
         values = [fifo.popleft() if fifo else None for fifo in self.fifos.values()]  # RET.Read tells which were there
+        left = {len(fifo) for fifo in self.fifos.values()}  # RET.Buff: as many whole messages, or something lacks
         number, command, *target = (0.0 if value is None else parse_number(value) for value in values)
-        if None in values or any(self.fifos.values()):  # RET.Buff tells what is left: of another message
+        if None in values or len(left) > 1:
             for fifo in self.fifos.values():
                 fifo.clear()
-            self._requests.pending, self._driver.status = 0, Status.GARBLED
-        elif self._requests.begin(int(command), int(number), KukaPose(*target)):
-            with contextlib.suppress(Resume):
-                self.interpreter.arm_interrupt(lambda: not self.flag1)
-                if self.flag1:
-                    yield from self._driver.drive()
-            self.interpreter.arm_interrupt(None)
-        self._reply(int(number))
-        yield
+            return Request(int(number), None)
+        self.flag2 = left != {0}
+        return Request(int(number), int(command), KukaPose(*target))
 
     def _reply(self, number: int) -> None:
         """EKI_Set... and EKI_Send, to whoever is there."""

@@ -52,8 +52,7 @@ class Interpreter:
         self._lines: Program | None = None
         self._closed, self._begun = threading.Event(), threading.Event()
         self.interrupt: Callable[[], bool] | None = None
-        """INTERRUPT ON with this condition: on its rising edge the arm brakes, and the program goes on after RESUME."""
-        self._was = False
+        """INTERRUPT ON: while it is true the arm brakes, and the program goes on after RESUME."""
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
@@ -70,11 +69,6 @@ class Interpreter:
     def reset(self) -> None:
         """Begin again with the first line: a reset program, or a controller that was switched on."""
         self._lines = None
-
-    def arm_interrupt(self, condition: Callable[[], bool] | None) -> None:
-        """INTERRUPT ON, or OFF: an interrupt sees edges alone, so what holds already does not strike."""
-        self._was = condition is not None and condition()
-        self.interrupt = condition
 
     def ptp(self, joints_deg: Joints) -> Program:
         """PTP and WAIT SEC 0: on until the arm is there, also when it was stopped on its way."""
@@ -99,12 +93,9 @@ class Interpreter:
             self.interrupt = None
             self._arm.driven = False
             self._lines = self._program()
-        if self.interrupt is not None:
-            strikes = self.interrupt()
-            edge, self._was = strikes and not self._was, strikes
-            if edge:
-                self.interrupt = None
-                self._arm.brake()
-                self._lines.throw(Resume())
-                return
+        if self.interrupt is not None and self.interrupt():
+            self.interrupt = None
+            self._arm.brake()
+            self._lines.throw(Resume())
+            return
         next(self._lines)

@@ -21,7 +21,7 @@ from weldscan.devices.robots.program import Status
 from weldscan.errors import InputError
 from weldscan.pose import format_e6axis, format_e6pos, format_frame, parse_frame, parse_number, parse_whole
 from weldscan.simulated.controllers import Arm, LinkFault, TcpController
-from weldscan.simulated.controllers.interpreter import Interpreter, Program, Resume, Timer
+from weldscan.simulated.controllers.interpreter import Interpreter, Program, Timer
 from weldscan.simulated.controllers.program import Driver
 
 NUMBERS = ("COM_ACTION", "COM_GO", "COM_TAKEN", "COM_DONE", "COM_STATUS")
@@ -74,11 +74,7 @@ class KvpController(TcpController):
                 yield
             request = self._number("COM_ACTION")
             self._driver.status = Status.LAPSED
-            try:
-                yield from self._take(request)
-            except Resume:
-                pass
-            self.interpreter.arm_interrupt(None)
+            yield from self._take(request)
             self.lease.set(0)
             self.variables |= {"COM_GO": "0", "COM_TAKEN": "0", "COM_STATUS": str(int(self._driver.status))}
             self.variables["COM_DONE"] = str(request)
@@ -89,10 +85,10 @@ class KvpController(TcpController):
     def _take(self, request: int) -> Program:
         goal = self.variables["COM_GOAL"] = self.variables["COM_TARGET"]
         try:
-            self._driver.look(parse_frame(goal))
+            if not self._driver.look(parse_frame(goal)):
+                return
         except InputError:
             self._driver.status = Status.GARBLED
-        if self._driver.status is not Status.TAKEN:
             return
         self._driver.status = Status.LAPSED
         self.variables["COM_GO"] = "0"
@@ -103,10 +99,7 @@ class KvpController(TcpController):
         ):
             yield
         if self._number("COM_GO") == request == self._number("COM_ACTION"):
-            self._driver.status = Status.STOPPED
-            self.interpreter.arm_interrupt(lambda: self.lease.flag)
-            if not self.lease.flag and self.arm.mode == "#T1":
-                yield from self._driver.drive()
+            yield from self._driver.drive(lambda: self.lease.flag)
 
     def _number(self, name: str) -> int:
         try:

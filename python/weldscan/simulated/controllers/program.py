@@ -2,72 +2,109 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 from weldscan.devices.robots import RESPITE_S
 from weldscan.devices.robots.kinematics import Joints
 from weldscan.devices.robots.program import INTERPOLATIONS, MODES, Command, Status
 from weldscan.pose import KukaPose
 from weldscan.simulated.controllers.arm import NULL_FRAME, Arm, LinkFault
-from weldscan.simulated.controllers.interpreter import Interpreter, Program, Timer
+from weldscan.simulated.controllers.interpreter import Interpreter, Program, Resume, Timer
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a client wants; without a command where not everything of it came."""
+
+    number: int
+    command: int | None
+    target: KukaPose = NULL_FRAME
 
 
 class Driver:
-    """WELDSCAN_DRIVE: the one way in which any of the programs moves the arm."""
+    """WELDSCAN_LOOK and WELDSCAN_DRIVE: the one way in which any of the programs moves the arm."""
 
     def __init__(self, arm: Arm, interpreter: Interpreter) -> None:
         self.arm, self.interpreter = arm, interpreter
         self.status = Status.DONE
-        self.joints: Joints | None = None
+        self._joints: Joints | None = None
 
-    def look(self, target: KukaPose) -> None:
-        """Say by `status` whether the arm may and can go to a flange pose; `joints` are then what INVERSE gave."""
-        self.joints = None
+    def look(self, target: KukaPose) -> bool:
+        """Say whether the arm may and can go to a flange pose, and by `status` why not."""
+        self._joints = None
         if self.arm.mode != "#T1":
             self.status = Status.NOT_IN_T1
-            return
+            return False
         self.arm.tool = self.arm.base = NULL_FRAME
-        self.joints = self.arm.inverse(target)
-        self.status = Status.OUT_OF_REACH if self.joints is None else Status.TAKEN
+        self._joints = self.arm.inverse(target)
+        self.status = Status.OUT_OF_REACH if self._joints is None else Status.TAKEN
+        return self._joints is not None
 
-    def drive(self) -> Program:
-        """Go to the joints that INVERSE gave."""
-        assert self.joints is not None
-        self.arm.driven = True
-        yield from self.interpreter.ptp(self.joints)
-        self.arm.driven = False
-        self.status = Status.DONE
+    def drive(self, lost: Callable[[], bool]) -> Program:
+        """Go to the joints that INVERSE gave, unless and until nobody wants it any more: then brake."""
+        assert self._joints is not None
+        self.status = Status.STOPPED
+        self.interpreter.interrupt, self.arm.driven = lost, True
+        try:
+            if not lost() and self.arm.mode == "#T1":
+                yield from self.interpreter.ptp(self._joints)
+                self.status = Status.DONE
+        except Resume:
+            pass
+        self.interpreter.interrupt, self.arm.driven = None, False
 
 
 class Requests:
-    """What the programs do that answer requests, over EthernetKRL and over a serial line: one pending target at most."""
+    """What the programs do that answer requests, over EthernetKRL and over a serial line: one target waits at most."""
 
-    def __init__(self, driver: Driver) -> None:
-        self.driver, self.timer = driver, Timer()
-        self.pending = 0
-        """The number whose GO is waited for."""
-        self.target = NULL_FRAME
+    def __init__(self, driver: Driver, receive: Callable[[], Request | None], reply: Callable[[int], None]) -> None:
+        self._driver, self._receive, self._reply = driver, receive, reply
+        self._timer = Timer()
+        self._held: Request | None = None
+        """What came while the arm moved, and made it brake."""
+        self.forget()
 
-    def begin(self, command: int, number: int, target: KukaPose) -> bool:
-        """Do what a request says but for the motion; True where that is to follow now."""
-        driver = self.driver
-        waited, self.pending = self.pending, 0
-        goes = command == Command.GO and number == waited != 0 and not self.timer.flag
-        if not goes:
-            self.target = NULL_FRAME
-        if command == Command.POSE:
-            driver.status = Status.DONE
-        elif command == Command.MOVE:
-            driver.look(target)
-            if driver.status is Status.TAKEN:
-                self.pending, self.target = number, target
-                self.timer.set(-1000 * RESPITE_S)
-        elif command == Command.GO:
-            driver.status = Status.STOPPED if goes else Status.LAPSED
-        else:
-            driver.status = Status.UNKNOWN_COMMAND
-        if goes and driver.arm.mode != "#T1":
-            driver.status = Status.NOT_IN_T1
-            return False
-        return goes
+    def forget(self) -> None:
+        """Drop what waits for its GO."""
+        self._pending, self.target = 0, NULL_FRAME
+
+    def serve(self) -> Program:
+        """One request, if there is one."""
+        request, self._held = self._held or self._receive(), None
+        if request is None or request.command == Command.BEAT:
+            return
+        driver, pending, self._pending = self._driver, self._pending, 0
+        if request.command != Command.GO:
+            self.forget()
+        match request.command:
+            case None:
+                driver.status = Status.GARBLED
+            case Command.POSE:
+                driver.status = Status.DONE
+            case Command.MOVE:
+                if driver.look(request.target):
+                    self._pending, self.target = request.number, request.target
+                    self._timer.set(-1000 * RESPITE_S)
+            case Command.GO if pending == request.number and not self._timer.flag:
+                self._timer.set(-1000 * RESPITE_S)
+                yield from driver.drive(lambda: self._lost(request.number))
+            case Command.GO:
+                driver.status = Status.LAPSED
+            case _:
+                driver.status = Status.UNKNOWN_COMMAND
+        if self._held is None:
+            self._reply(request.number)
+
+    def _lost(self, number: int) -> bool:
+        """While the arm moves: is it wanted no longer? A BEAT with its number says for two seconds that it is."""
+        request = self._receive()
+        if request is not None and (request.command, request.number) != (Command.BEAT, number):
+            self._held = request
+            return True
+        if request is not None:
+            self._timer.set(-1000 * RESPITE_S)
+        return self._timer.flag
 
 
 def codes(arm: Arm) -> tuple[int, int]:

@@ -12,7 +12,7 @@ from weldscan.errors import DeviceError, DeviceTimeout
 from weldscan.pose import KukaPose, parse_number, parse_whole
 from weldscan.simulated.controllers import Arm, LinkFault, StreamController
 from weldscan.simulated.controllers.interpreter import Interpreter, Program
-from weldscan.simulated.controllers.program import Driver, Requests, codes, reading
+from weldscan.simulated.controllers.program import Driver, Request, Requests, codes, reading
 
 
 class SerialController(StreamController):
@@ -31,9 +31,10 @@ class SerialController(StreamController):
         tty.setraw(self._far)  # and keep it open: the terminal lives on when a client closes its own
         self.port = os.ttyname(self._far)
         self._line = _Kept(self._near)
+        self._messages = Messages(self._line, self.cut)
         self.interpreter = Interpreter(self.arm, self._program, lambda: self.running)
         self._driver = Driver(self.arm, self.interpreter)
-        self._requests = Requests(self._driver)
+        self._requests = Requests(self._driver, self._receive, self._reply)
         self.interpreter.start()
 
     def close(self) -> None:
@@ -54,24 +55,24 @@ class SerialController(StreamController):
     # --- WELDSCAN_SERIAL -----------------------------------------------------------------------------------------------
 
     def _program(self) -> Program:
-        messages = Messages(self._line, self.cut)
-        while messages.unasked():  # what came before this start is nobody's wish any more
+        self._messages = Messages(self._line, self.cut)
+        while self._messages.unasked():  # what came before this start is nobody's wish any more
             yield
-        self._requests.pending = 0
+        self._requests.forget()
         while True:
+            yield from self._requests.serve()
             yield
-            try:
-                line = messages.next(time.monotonic() + 0.001)
-                number, texts = decode_line(line)
-                command, target = parse_whole(texts[0]), KukaPose(*map(parse_number, texts[1:7]))
-            except DeviceTimeout:
-                continue
-            except (DeviceError, ValueError, TypeError, IndexError):
-                messages = Messages(self._line, self.cut)
-                continue
-            if self._requests.begin(command, number, target):
-                yield from self._driver.drive()
-            self._reply(number)
+
+    def _receive(self) -> Request | None:
+        try:
+            number, texts = decode_line(self._messages.next(time.monotonic()))
+            command, *target = texts
+            return Request(number, parse_whole(command), KukaPose(*map(parse_number, target)))
+        except DeviceTimeout:
+            pass
+        except (DeviceError, ValueError, TypeError):
+            self._messages = Messages(self._line, self.cut)
+        return None
 
     def _reply(self, number: int) -> None:
         fault = self._next_fault()

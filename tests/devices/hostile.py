@@ -6,15 +6,22 @@ Every attack knows the truth, so that what a link made of it is either that, an 
 from __future__ import annotations
 
 import contextlib
+import math
 import random
 import re
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
 
 from weldscan import DeviceError, KukaPose
-from weldscan.devices.robots import Robot
+from weldscan.devices import backend
+from weldscan.devices.robots import RESPITE_S, Robot
 from weldscan.devices.robots.plausible import distance
 from weldscan.simulated.controllers import Arm
 
@@ -199,6 +206,7 @@ class Proxy:
     def __init__(self, port: int, spoil: Spoil, seed: int) -> None:
         self.spoil, self.chance = spoil, random.Random(seed)
         self.on = False
+        self._open: set[socket.socket] = set()
         self._there = ("127.0.0.1", port)
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
@@ -206,6 +214,13 @@ class Proxy:
 
     def close(self) -> None:
         self._listener.close()
+
+    def unplug(self) -> None:
+        """Hang up on both sides, and let nobody through again."""
+        self.close()
+        for peer in list(self._open):
+            with contextlib.suppress(OSError):
+                peer.shutdown(socket.SHUT_RDWR)
 
     def _accept(self) -> None:
         with contextlib.suppress(OSError):
@@ -215,6 +230,7 @@ class Proxy:
 
     def _serve(self, near: socket.socket) -> None:
         with contextlib.suppress(OSError), near, socket.create_connection(self._there, 2.0) as far:
+            self._open |= {near, far}
             threading.Thread(target=self._requests, args=(near, far), daemon=True).start()
             last = b""
             while reply := far.recv(65536):
@@ -242,3 +258,113 @@ def tcp_cases(count: int) -> Iterator[tuple[str, int]]:
     names = sorted(SPOILS)
     for number in range(count):
         yield names[number % len(names)], number
+
+
+# --- whoever asked for a motion goes away -----------------------------------------------------------------------------
+
+MOVER = """
+import signal, sys
+from weldscan import DeviceError, KukaPose
+from weldscan.devices import backend
+
+def stop(*_):
+    raise KeyboardInterrupt
+
+signal.signal(signal.SIGINT, stop)
+signal.signal(signal.SIGTERM, stop)
+robot = backend("robot", sys.argv[1])
+port = sys.argv[2] if sys.argv[1] == "serial" else int(sys.argv[2])
+client = robot(robot.Settings(port=port, allow_motion=True, timeout_s=1.0, reconnect_s=1.0))
+print("ready", flush=True)
+sys.stdin.readline()
+try:
+    print("arrived", client.move_to(KukaPose(*map(float, sys.argv[3:]))), flush=True)
+except (DeviceError, KeyboardInterrupt) as error:
+    print("ended:", error, flush=True)
+"""
+"""Moves the flange, in a process of its own, when it is told to."""
+FAR = KukaPose(1690.825, -148.476, 981.652, -29.008, 23.236, 74.641)
+"""Four seconds away."""
+SPEED_MM_S = 20.0
+LONGEST_LET_GO_S = 3.5
+GRACE_S = 0.1
+"""A program looks every few ms, on a machine that others use."""
+
+
+@dataclass
+class Aftermath:
+    """What was left of a motion whose asker went away."""
+
+    armed: bool
+    """Did anything still wait, two seconds after the program could drop it?"""
+    late_s: float
+    """How long after the asker's end the last motion began; minus infinity for none."""
+    travelled_mm: float
+    said: str
+    let_go: bool
+    """Was the start key let go meanwhile?"""
+
+
+def interrupted(link: str, kind: str, seed: int) -> Aftermath:
+    """Let a process ask for a motion, end it at a random moment, and look on for a while.
+
+    In every second case the start key has been let go by then, and is pressed again some seconds later.
+    """
+    chance = random.Random(f"{link} {kind} {seed}")
+    arm = Arm(TRUE)
+    arm.speed_mm_s = SPEED_MM_S
+    with backend("controller", link)(arm) as controller:
+        proxy = Proxy(controller.port, SPOILS["twice"], seed) if link != "serial" else None
+        port = controller.port if proxy is None else proxy.port
+        process = subprocess.Popen(
+            [sys.executable, "-c", MOVER, link, str(port), *map(str, FAR.values())],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.stdin.write("\n")
+        process.stdin.flush()
+        until_s = chance.uniform(0.0, 0.5)
+        let_go = chance.random() < 0.5
+        if let_go:
+            time.sleep(until_s * chance.random())
+            hold(controller, False)
+        time.sleep(until_s)
+        before = arm.flange()
+        if kind == "lost":
+            if proxy is None:
+                process.send_signal(signal.SIGSTOP)  # a line knows no end: nothing is said any more
+            else:
+                proxy.unplug()
+        else:
+            process.send_signal(getattr(signal, f"SIG{kind}"))
+        end_s = runs_s = time.monotonic()
+        if let_go:
+            time.sleep(chance.uniform(0.3, LONGEST_LET_GO_S))
+            hold(controller, True)
+            runs_s = time.monotonic()  # a program that stands cannot drop anything
+        time.sleep(RESPITE_S + GRACE_S + runs_s - time.monotonic())
+        armed = is_armed(controller)
+        if kind == "lost":
+            process.kill()
+        said, _ = process.communicate(timeout=20)
+        begun_s = max(arm.begun_s, default=-math.inf)
+        return Aftermath(armed, begun_s - end_s, distance(before, arm.flange())[0], said, let_go)
+
+
+def hold(controller: Any, pressed: bool) -> None:
+    """Press the start key, or let it go."""
+    if hasattr(controller, "variables"):
+        controller.variables["$PRO_STATE1"] = "#P_ACTIVE" if pressed else "#P_STOP"
+    else:
+        controller.running = pressed
+
+
+def is_armed(controller: Any) -> bool:
+    """Does anything wait that could set the arm off?"""
+    if hasattr(controller, "variables"):
+        return controller.variables["COM_ACTION"] != "0" or controller.variables["COM_GO"] != "0"
+    return controller._requests.waits

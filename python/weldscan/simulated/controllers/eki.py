@@ -121,9 +121,10 @@ class EkiController(TcpController):
 
     def _reply(self, number: int) -> None:
         """EKI_Set... and EKI_Send, to whoever is there."""
-        transport, fault = self._client, self._next_fault()
+        transport = self._client
         if transport is None:
             return
+        fault = self._next_fault()
         with contextlib.suppress(DeviceError, OSError):
             for piece in self._spoilt(self._composed(number, fault), fault):
                 transport.send(piece, time.monotonic() + 2.0)

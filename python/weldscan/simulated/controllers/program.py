@@ -69,6 +69,11 @@ class Requests:
         """Drop what waits for its GO."""
         self._pending, self.target = 0, NULL_FRAME
 
+    @property
+    def waits(self) -> bool:
+        """Would a GO set the arm off now?"""
+        return self._pending != 0 and not self._timer.flag
+
     def serve(self) -> Program:
         """One request, if there is one."""
         request, self._held = self._held or self._receive(), None

@@ -213,6 +213,7 @@ class Proxy:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def close(self) -> None:
+        self._listener.shutdown(socket.SHUT_RDWR)  # wakes whoever waits in accept()
         self._listener.close()
 
     def unplug(self) -> None:
@@ -314,7 +315,7 @@ def interrupted(link: str, kind: str, seed: int) -> Aftermath:
     arm = Arm(TRUE)
     arm.speed_mm_s = SPEED_MM_S
     with backend("controller", link)(arm) as controller:
-        proxy = Proxy(controller.port, SPOILS["twice"], seed) if link != "serial" else None
+        proxy = Proxy(controller.port, SPOILS["twice"], seed) if link != "serial" and kind == "lost" else None
         port = controller.port if proxy is None else proxy.port
         process = subprocess.Popen(
             [sys.executable, "-c", MOVER, link, str(port), *map(str, FAR.values())],

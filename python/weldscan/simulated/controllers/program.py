@@ -103,13 +103,15 @@ class Requests:
 
     def _lost(self, number: int) -> bool:
         """While the arm moves: is it wanted no longer? A BEAT with its number says for two seconds that it is."""
+        if self._timer.flag:  # before a BEAT that has lain in the line for long is taken for a new one
+            return True
         request = self._receive()
         if request is not None and (request.command, request.number) != (Command.BEAT, number):
             self._held = request
             return True
         if request is not None:
             self._timer.set(-1000 * RESPITE_S)
-        return self._timer.flag
+        return False
 
 
 def codes(arm: Arm) -> tuple[int, int]:

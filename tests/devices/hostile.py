@@ -92,7 +92,9 @@ def rsi_streams() -> dict[str, list[Packet]]:
         "the same IPOC, another pose": [(CYCLE_S, 0, rsi_packet(FALSE, 1476))] * 120,
         "IPOC 0": [(CYCLE_S, 0, rsi_packet(FALSE, 0))] * 120,
         "late packets between": interleaved(on[:60], old),
-        "a late packet now and then": [p for i in range(60) for p in ([on[i]] + ([(0.0, *old[i][1:])] if i % 10 == 9 else []))],
+        "a late packet now and then": [
+            p for i in range(60) for p in ([on[i]] + ([(0.0, *old[i][1:])] if i % 10 == 9 else []))
+        ],
         "a second of backlog at once": [(1.0, 0, b"")] + [(0.0, 0, p) for _, _, p in honest(FALSE, 1480, 240)],
         "second sender ahead": interleaved(on[:60], honest(FALSE, 9000, 60, 1)),
         "second sender with the same IPOC": interleaved(on[:60], honest(FALSE, 1480, 60, 1)),
@@ -100,9 +102,14 @@ def rsi_streams() -> dict[str, list[Packet]]:
         "another address": honest(FALSE, 2000, 120, 2),
         "no IPOC": now(lambda packet: re.sub(rb"<IPOC>.*</IPOC>", b"", packet)),
         "two IPOCs": now(lambda packet: packet.replace(b"<IPOC>", b"<IPOC>77</IPOC><IPOC>", 1)),
-        "metres": [(w, s, re.sub(rb"<RIst[^>]*>", rsi_packet(metres, 0).split(b"<AIPos")[0][17:], p)) for w, s, p in on],
+        "metres": [
+            (w, s, re.sub(rb"<RIst[^>]*>", rsi_packet(metres, 0).split(b"<AIPos")[0][17:], p)) for w, s, p in on
+        ],
         "all zeros": now(lambda packet: re.sub(rb'"-?\d+\.\d+"', b'"0.0"', packet)),
-        "two metres away for good": [(0.4, 0, b""), *[(CYCLE_S, 0, rsi_packet(far, 2000 + 4 * i, TRUE)) for i in range(100)]],
+        "two metres away for good": [
+            (0.4, 0, b""),
+            *[(CYCLE_S, 0, rsi_packet(far, 2000 + 4 * i, TRUE)) for i in range(100)],
+        ],
         "5_0_0 and Arabic digits": with_x("1_612.325") + with_x("١٦١٢.٣٢٥"),
         "UTF-16 with a DTD": now(lambda packet: (dtd + packet).decode().encode("utf-16")),
     }

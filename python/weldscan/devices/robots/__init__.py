@@ -164,7 +164,10 @@ class Robot(abc.ABC):
             raise DeviceError(f"{self.name}: motion is off; allow_motion = true in the configuration allows it")
         if (wrong := out_of_reach(target)) is not None:
             raise DeviceError(f"{self.name}: the target: {wrong}")
-        reading = self.read()
+        try:
+            reading = self.read()
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("stopped before anything was asked of the robot") from None
         if reading.mode.upper() != "#T1":
             raise DeviceError(f"{self.name}: motion only in T1, the controller says {reading.mode or 'nothing'}")
         away_mm, away_deg = distance(self._believed(reading).flange, target)

@@ -309,7 +309,9 @@ class KvpRobot(StreamRobot):
     ) -> list[str]:
         number = self._next_number()
         request = encode_request(number, function, texts)
-        return self._link.ask(request, lambda frame: decode_reply(frame, number, function, count), repeat, deadline).value
+        return self._link.ask(
+            request, lambda frame: decode_reply(frame, number, function, count), repeat, deadline
+        ).value
 
     def _heartbeat(self) -> None:
         while not self._closed.wait(HEARTBEAT_S / 4):

@@ -65,9 +65,7 @@ def jumped(last: Told, told: Told) -> str | None:
     return None
 
 
-def contradicted(
-    told: Told, root: Floats, arm: ArmGeometry | None, within_mm: float, within_deg: float
-) -> str | None:
+def contradicted(told: Told, root: Floats, arm: ArmGeometry | None, within_mm: float, within_deg: float) -> str | None:
     """Return how joints and pose contradict each other, or None.
 
     How the flange is turned follows from the joints of every six-axis KUKA, whatever its lengths; where it is takes

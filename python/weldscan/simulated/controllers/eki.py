@@ -38,7 +38,7 @@ class EkiController(TcpController):
         super().__init__(arm, host, port)
         self.interpreter = Interpreter(self.arm, self._program, lambda: self.running and not self._away.is_set())
         self._driver = Driver(self.arm, self.interpreter)
-        self._requests = Requests(self._driver, self._receive, self._reply)
+        self._requests = Requests(self._driver, self._receive, self._reply, lambda: self.flag1)
         if config.asks:
             self.interpreter.start()
 
@@ -88,7 +88,7 @@ class EkiController(TcpController):
         while True:
             while not self.flag1:
                 yield
-            while self.flag1:
+            while self.flag1 and not self._requests.left:
                 yield from self._requests.serve()
                 yield
             self._open_anew()
@@ -104,8 +104,6 @@ class EkiController(TcpController):
         self._requests.forget()
 
     def _receive(self) -> Request | None:
-        if not self.flag1:
-            return Request(0, None)  # nobody is there any more, which makes a moving arm brake
         if not self.flag2:
             return None
         self.flag2 = False

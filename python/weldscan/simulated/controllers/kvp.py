@@ -94,9 +94,7 @@ class KvpController(TcpController):
         self.variables["COM_GO"] = "0"
         self.lease.set(-1000 * RESPITE_S)
         self.variables["COM_TAKEN"] = str(request)
-        while not (
-            self._number("COM_GO") == request or self._number("COM_ACTION") != request or self.lease.flag
-        ):
+        while not (self._number("COM_GO") == request or self._number("COM_ACTION") != request or self.lease.flag):
             yield
         if self._number("COM_GO") == request == self._number("COM_ACTION"):
             yield from self._driver.drive(lambda: self.lease.flag)

@@ -58,8 +58,14 @@ class Driver:
 class Requests:
     """What the programs do that answer requests, over EthernetKRL and over a serial line: one target waits at most."""
 
-    def __init__(self, driver: Driver, receive: Callable[[], Request | None], reply: Callable[[int], None]) -> None:
-        self._driver, self._receive, self._reply = driver, receive, reply
+    def __init__(
+        self,
+        driver: Driver,
+        receive: Callable[[], Request | None],
+        reply: Callable[[int], None],
+        connected: Callable[[], bool] = lambda: True,
+    ) -> None:
+        self._driver, self._receive, self._reply, self._connected = driver, receive, reply, connected
         self._timer = Timer()
         self._held: Request | None = None
         """What came while the arm moved, and made it brake."""
@@ -68,6 +74,8 @@ class Requests:
     def forget(self) -> None:
         """Drop what waits for its GO."""
         self._pending, self.target = 0, NULL_FRAME
+        self.left = False
+        """Did whoever asked hang up while the arm moved? Somebody else may be there by now."""
 
     @property
     def waits(self) -> bool:
@@ -98,12 +106,13 @@ class Requests:
                 driver.status = Status.LAPSED
             case _:
                 driver.status = Status.UNKNOWN_COMMAND
-        if self._held is None:
+        if self._held is None and not self.left:
             self._reply(request.number)
 
     def _lost(self, number: int) -> bool:
         """While the arm moves: is it wanted no longer? A BEAT with its number says for two seconds that it is."""
-        if self._timer.flag:  # before a BEAT that has lain in the line for long is taken for a new one
+        self.left = not self._connected()
+        if self.left or self._timer.flag:  # before a BEAT that has lain in the line for long is taken for a new one
             return True
         request = self._receive()
         if request is not None and (request.command, request.number) != (Command.BEAT, number):

@@ -36,10 +36,10 @@ _LONGEST = 1000
 
 
 def parse_number(text: str) -> float:
-    """Return the number that a whole text is, as controllers and people write numbers: ASCII digits, a point, an exponent.
+    """Return the number that a whole text is, as controllers and people write it: ASCII digits, a point, an exponent.
 
-    Raises `InputError` for what Python would take besides (`5_0_0`, other scripts' digits, blanks, `nan`, `inf`) and for
-    what does not fit into a double.
+    Raises `InputError` for what Python would take besides (`5_0_0`, other scripts' digits, blanks, `nan`, `inf`) and
+    for what does not fit into a double.
 
     >>> from weldscan.pose import parse_number
     >>> parse_number("-12.5e1")

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from weldscan import KukaPose
 from weldscan.devices.robots import distance
-from weldscan.simulated.controllers import HOME, HOME_JOINTS, Arm, OutOfReach
 from weldscan.devices.robots.kinematics import ArmGeometry
+from weldscan.simulated.controllers import HOME, HOME_JOINTS, Arm, OutOfReach
 
 ARM = ArmGeometry()
 MM = 1e-4

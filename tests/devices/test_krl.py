@@ -98,7 +98,7 @@ def test_elements_are_those_of_the_configuration():
 
 @pytest.mark.parametrize("path", MOVING, ids=lambda path: path.stem)
 def test_motion(path):
-    """One PTP apart from block coincidence, to what INVERSE gave, behind every look and under an interrupt that brakes."""
+    """One PTP apart from block coincidence: to what INVERSE gave, behind a look, under an interrupt that brakes."""
     code = "\n".join(lines(path))
     shared = "\n".join(lines(KRL / "weldscan_drive.src"))
     assert re.findall(r"(?m)^(?:PTP|LIN|CIRC).*", code) == ["PTP JOINTS"]

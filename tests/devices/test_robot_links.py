@@ -14,6 +14,7 @@ import pytest
 from weldscan import DeviceError, DeviceTimeout, KukaPose
 from weldscan.devices.robots import distance, wait_until_still
 from weldscan.devices.robots.eki import EkiRobot, EkiSettings
+from weldscan.devices.robots.kinematics import ArmGeometry
 from weldscan.devices.robots.kvp import READ, KvpRobot, KvpSettings, encode_request
 from weldscan.devices.robots.rsi import RsiRobot, RsiSettings
 from weldscan.devices.robots.serial import SerialRobot, SerialSettings, cut_line
@@ -21,7 +22,6 @@ from weldscan.devices.robots.wire import ConnectionLost, FileTransport, Link
 from weldscan.pose import format_frame
 from weldscan.simulated.controllers import Arm, LinkFault, TcpController
 from weldscan.simulated.controllers.eki import EkiController
-from weldscan.devices.robots.kinematics import ArmGeometry
 from weldscan.simulated.controllers.kvp import KvpController
 from weldscan.simulated.controllers.rsi import RsiController
 from weldscan.simulated.controllers.serial import SerialController

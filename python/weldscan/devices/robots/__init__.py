@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import abc
 import contextlib
-import math
 import secrets
 import threading
 import time
@@ -21,7 +20,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from weldscan.devices.robots.kinematics import ArmGeometry
-from weldscan.devices.robots.plausible import Told, contradicted, distance, jumped, out_of_reach
+from weldscan.devices.robots.plausible import Told, contradicted, jumped, out_of_reach
+from weldscan.devices.robots.plausible import distance as distance
 from weldscan.devices.robots.wire import Cut, Deadline, Link, Transport
 from weldscan.errors import DeviceError, DeviceTimeout
 from weldscan.pose import KukaPose
@@ -31,7 +31,7 @@ AT_REST_MM, AT_REST_DEG = 0.01, 0.002
 """Two readings in a row that differ by less: the arm stands. A tenth of the repeatability of a small KUKA (0.03 mm)."""
 
 RESPITE_S = 2.0
-"""How long the programs on the controller wait for the word to go, and how long a motion outlives whoever asked for it."""
+"""How long the programs on the controller wait for the word to go, and how long a motion outlives its asker."""
 CALL_BACK_S = 2.0
 """How long a motion that went wrong is called back and looked at, before the error is told."""
 SINGLE_MM, SINGLE_DEG = 0.002, 1e-3
@@ -60,8 +60,8 @@ class RobotSettings(BaseModel):
     at_target_mm: Annotated[float, Field(gt=0)] = 0.1
     at_target_deg: Annotated[float, Field(gt=0)] = 0.02
     arm: Six | None = None
-    """Lengths of the arm, mm: foot, shoulder, upper arm, elbow, forearm, wrist; with them the joints show where the flange
-    is, and not only how it is turned."""
+    """Lengths of the arm, mm: foot, shoulder, upper arm, elbow, forearm, wrist; with them the joints show where the
+    flange is, and not only how it is turned."""
     root: Six = (0.0,) * 6
     """$ROBROOT, X Y Z A B C: where the foot stands."""
     joints_within_mm: Annotated[float, Field(gt=0)] = 10.0
@@ -155,8 +155,8 @@ class Robot(abc.ABC):
         """Move the flange to a pose in base, point to point, and return where it then stands.
 
         Refused unless the configuration allows motion, the controller says T1, and the target is near. Returns only
-        when the MEASURED pose is at the target and at rest. Otherwise, and whatever ends it - an error, Ctrl-C, SIGTERM -
-        the motion is called back first, and what is raised says in which state the robot is then.
+        when the MEASURED pose is at the target and at rest. Otherwise, and whatever ends it - an error, Ctrl-C,
+        SIGTERM - the motion is called back first, and what is raised says in which state the robot is then.
         """
         if not self.moves:
             raise DeviceError(f"{self.name}: this link only reads")

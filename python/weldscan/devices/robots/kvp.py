@@ -187,9 +187,9 @@ class KvpRobot(StreamRobot):
         self._ask(WRITE, [name, value], 1, deadline or self._link.deadline(), repeat=False)
 
     def read(self, deadline: Deadline | None = None) -> Reading:
-        """Read $POS_ACT between two readings of the frames: a change between them cannot make a wrong pose. All of it within
-        `timeout_s`, or it is read anew: a position is of the frames of its own moment, not of those before a lost
-        connection.
+        """Read $POS_ACT between two readings of the frames: a change between them cannot make a wrong pose. All of it
+        within `timeout_s`, or it is read anew: a position is of the frames of its own moment, not of those before a
+        lost connection.
         """
         deadline = deadline or self._link.deadline()
         for _ in range(3):

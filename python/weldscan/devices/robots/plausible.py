@@ -25,7 +25,7 @@ JUMP_SLACK_MM, JUMP_SLACK_DEG = 2.0, 1.0
 LEVER_MM = 5_000.0
 """No joint of any KUKA is further from the flange: what a joint's turn can move it by, per radian."""
 SKEW_MM = 10.0
-"""A pose and joints that are read one after the other belong to instants up to 12 ms apart; twice that in T1 is 6 mm."""
+"""A pose and joints that are read one after the other belong to instants up to 12 ms apart; twice in T1: 6 mm."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """RSI: the controller sends its pose as XML over UDP every 4 or 12 ms, and stops when it gets no answer in time.
 
 Used here to read poses only: every answer carries zero corrections and echoes IPOC, digit by digit. A process of its
-own (`rsi_answer.py`) answers before anyone looks, and says which packets are in order. With ONLYSEND = TRUE in the configuration the controller wants no
-answer, which is the better choice for a measuring cell: `krl/WeldscanRsi.xml`.
+own (`rsi_answer.py`) answers before anyone looks, and says which packets are in order. With ONLYSEND = TRUE in the
+configuration the controller wants no answer, which is the better choice for a measuring cell: `krl/WeldscanRsi.xml`.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class RsiRobot(Robot):
         self.settings = settings
         self.name = f"RSI {settings.host}:{settings.port}"
         self.packets = self.answered = self.unusable = self.stale = self.strangers = self.restarts = self.held = 0
-        """What came, was answered, was no packet, was out of order, was of others; how often the stream began anew; what had
-        lain in the socket."""
+        """What came, was answered, was no packet, was out of order, was of others; how often the stream began anew;
+        what had lain in the socket."""
         self._lock = threading.Lock()
         self._reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._reports.bind(("127.0.0.1", 0))

@@ -83,9 +83,9 @@ class _Stream:
 class Order:
     """Freshness is order: which packets of all that come are the present of the one controller.
 
-    IPOC grows with every packet. Who has sent ten that grew, steadily, is the controller, by address and port; from then on
-    nobody else is heard, nothing that does not grow, and nothing that was seen before. Only when it has been silent for half a
-    second may a stream begin again, under the same conditions.
+    IPOC grows with every packet. Who has sent ten that grew, steadily, is the controller, by address and port; from
+    then on nobody else is heard, nothing that does not grow, and nothing that was seen before. Only when it has been
+    silent for half a second may a stream begin again, under the same conditions.
     """
 
     def __init__(self) -> None:

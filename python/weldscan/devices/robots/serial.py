@@ -55,10 +55,10 @@ def checksum(data: bytes) -> int:
 
 
 def encode_line(number: int, values: Sequence[float]) -> bytes:
-    """Return one line; whole numbers are written as such, others with six decimals.
+    r"""Return one line; whole numbers are written as such, others with six decimals.
 
     >>> encode_line(7, [1, 0.5])
-    b'7,1,0.500000*52293\\r\\n'
+    b'7,1,0.500000*52293\r\n'
     """
     text = ",".join(str(value) if isinstance(value, int) else f"{value:.6f}" for value in (number, *values)).encode()
     return text + b"*%d\r\n" % checksum(text)
@@ -129,7 +129,7 @@ class SerialTransport:
 
 
 def connect(port: str, baud: int, deadline_s: float) -> Transport:
-    """Open a port. `socket://host:port` is TCP and nothing else; pyserial would wait 5 s for it whatever the deadline."""
+    """Open a port. `socket://host:port` is TCP and nothing else; pyserial would wait 5 s for it, whatever it may."""
     if not port.lower().startswith("socket://"):
         return SerialTransport(port, baud)
     try:

@@ -21,8 +21,8 @@ class EkiController(TcpController):
     """A simulated controller with EthernetKRL over TCP: our program, or a state stream as other configurations have
     it.
 
-    With our program it serves one client at a time. Flags and FIFOs, one per element, outlive clients and programs; what a
-    message lacks stays lacking in its FIFO alone. `running` is the start key.
+    With our program it serves one client at a time. Flags and FIFOs, one per element, outlive clients and programs;
+    what a message lacks stays lacking in its FIFO alone. `running` is the start key.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class EkiController(TcpController):
         return b""
 
     def serve(self, transport: Transport) -> None:
-        """Put what a client sends into the FIFOs; or stream states and obey commands, as another configuration has it."""
+        """Put what a client sends into the FIFOs; or stream states and obey, as another configuration has it."""
         if not self.config.asks:
             if self.config.send:
                 threading.Thread(target=self._stream, args=(transport,), daemon=True).start()
@@ -74,14 +74,14 @@ class EkiController(TcpController):
             self._client, self.flag1 = None, False
 
     def _put(self, message: bytes) -> None:
-        """What EthernetKRL does with a message: every element that is there into its FIFO, and the flag of the whole."""
+        """What EthernetKRL does with a message: every element that is there into its FIFO, and the flag."""
         parse_xml(message, self.config.receive[0].path[0])
         for element, fifo in self.fifos.items():
             with contextlib.suppress(DeviceError):
                 fifo.append(dissect((element,), message)[element])
         self.flag2 = True
 
-    # --- WELDSCAN_EKI --------------------------------------------------------------------------------------------------
+    # --- WELDSCAN_EKI -------------------------------------------------------------------------------------------------
 
     def _program(self) -> Program:
         self._open_anew()

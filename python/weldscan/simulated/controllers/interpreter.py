@@ -1,7 +1,7 @@
 """What runs a KRL program on the simulated controllers: line by line, stopped, continued and reset as from the pendant.
 
-A program is a generator that yields between its lines. Its variables, flags and FIFOs live in the controller and outlive
-it, as they do on a real one; so does the clock of its timers, which runs on while the program stands.
+A program is a generator that yields between its lines. Its variables, flags and FIFOs live in the controller and
+outlive it, as they do on a real one; so does the clock of its timers, which runs on while the program stands.
 """
 
 from __future__ import annotations
@@ -9,16 +9,17 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 
-from weldscan.simulated.controllers.arm import Arm, Joints
+from weldscan.devices.robots.kinematics import Joints
+from weldscan.simulated.controllers.arm import Arm
 
 LINE_S = 0.002
 """A controller's interpreter takes a few lines per cycle of 12 ms; here one look at what is waited for."""
-Program = Iterator[None]
+Program = Generator[None, None, None]
 
 
-class Resume(Exception):  # noqa: N818 - a statement of KRL, not an error
+class Resume(Exception):
     """RESUME in an interrupt's program: back to the level in which the interrupt was declared."""
 
 

@@ -62,7 +62,7 @@ class KvpController(TcpController):
         """Cut one request."""
         return cut_frame(buffer)
 
-    # --- WELDSCAN_KVP --------------------------------------------------------------------------------------------------
+    # --- WELDSCAN_KVP -------------------------------------------------------------------------------------------------
 
     def _program(self) -> Program:
         for name in NUMBERS:
@@ -105,7 +105,7 @@ class KvpController(TcpController):
         except InputError:
             return 0
 
-    # --- KUKAVARPROXY --------------------------------------------------------------------------------------------------
+    # --- KUKAVARPROXY -------------------------------------------------------------------------------------------------
 
     def answer(self, request: bytes, fault: LinkFault | None) -> bytes:
         """Read or write variables."""

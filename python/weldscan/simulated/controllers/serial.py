@@ -52,7 +52,7 @@ class SerialController(StreamController):
         """Nothing is answered without the program."""
         return b""
 
-    # --- WELDSCAN_SERIAL -----------------------------------------------------------------------------------------------
+    # --- WELDSCAN_SERIAL ----------------------------------------------------------------------------------------------
 
     def _program(self) -> Program:
         self._messages = Messages(self._line, self.cut)

@@ -283,12 +283,12 @@ signal.signal(signal.SIGTERM, stop)
 robot = backend("robot", sys.argv[1])
 port = sys.argv[2] if sys.argv[1] == "serial" else int(sys.argv[2])
 client = robot(robot.Settings(port=port, allow_motion=True, timeout_s=1.0, reconnect_s=1.0))
-print("ready", flush=True)
-sys.stdin.readline()
 try:
+    print("ready", flush=True)
+    sys.stdin.readline()
     print("arrived", client.move_to(KukaPose(*map(float, sys.argv[3:]))), flush=True)
 except (DeviceError, KeyboardInterrupt) as error:
-    print("ended:", error, flush=True)
+    print("ended:", str(error) or "before anything was asked", flush=True)
 """
 """Moves the flange, in a process of its own, when it is told to."""
 FAR = KukaPose(1690.825, -148.476, 981.652, -29.008, 23.236, 74.641)

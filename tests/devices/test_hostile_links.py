@@ -129,6 +129,7 @@ def attacked(case):
     return link, name, seed, wrong, right, longest_s
 
 
+@pytest.mark.timeout(3600)
 def test_spoilt_replies(soak):
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(attacked, hostile.tcp_cases(1000 if soak else 60)))
@@ -140,6 +141,7 @@ def test_spoilt_replies(soak):
 # --- whoever asked goes away ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.timeout(3600)
 def test_motion_does_not_outlive_its_asker(soak):
     each = [*itertools.product(("kvp", "eki", "serial"), ("INT", "TERM", "KILL", "lost"))]
     some = each if soak else [(link, kind) for link, kind in each if link == "kvp" or kind in ("INT", "lost")]

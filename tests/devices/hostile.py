@@ -278,6 +278,8 @@ from weldscan.devices import backend
 def stop(*_):
     raise KeyboardInterrupt
 
+target = KukaPose(*map(float, sys.argv[3:]))
+KukaPose.from_matrix(target.matrix())  # the core has met its first array, which no signal may interrupt
 signal.signal(signal.SIGINT, stop)
 signal.signal(signal.SIGTERM, stop)
 robot = backend("robot", sys.argv[1])
@@ -286,7 +288,7 @@ client = robot(robot.Settings(port=port, allow_motion=True, timeout_s=1.0, recon
 try:
     print("ready", flush=True)
     sys.stdin.readline()
-    print("arrived", client.move_to(KukaPose(*map(float, sys.argv[3:]))), flush=True)
+    print("arrived", client.move_to(target), flush=True)
 except (DeviceError, KeyboardInterrupt) as error:
     print("ended:", str(error) or "before anything was asked", flush=True)
 """
@@ -295,8 +297,8 @@ FAR = KukaPose(1690.825, -148.476, 981.652, -29.008, 23.236, 74.641)
 """Four seconds away."""
 SPEED_MM_S = 20.0
 LONGEST_LET_GO_S = 3.5
-GRACE_S = 0.1
-"""A program looks every few ms, on a machine that others use."""
+GRACE_S = 0.5
+"""A program looks every few ms, and what is on its way arrives, on a machine that others use."""
 
 
 @dataclass

@@ -97,6 +97,15 @@ def test_target_alone_moves_nothing(eki, arm):
     assert not controller._requests.waits
 
 
+def test_go_for_nothing(eki, arm):
+    _, peer = eki
+    peer.say(eki_request(5, Command.MOVE, NEAR.values()))
+    peer.say(eki_request(6, Command.POSE))
+    peer.say(eki_request(0, Command.GO))
+    assert [peer.hear() for _ in range(3)] == [(5, Status.TAKEN), (6, Status.DONE), (0, Status.LAPSED)]
+    assert arm.begun_s == []
+
+
 def test_go_comes_in_time_or_not_at_all(eki, arm):
     _, peer = eki
     peer.say(eki_request(5, Command.MOVE, NEAR.values()))

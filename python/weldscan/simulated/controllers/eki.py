@@ -34,7 +34,7 @@ class EkiController(TcpController):
         self.flag1 = self.flag2 = False
         """$FLAG[1]: a client is there. $FLAG[2]: a request is there."""
         self._client: TcpTransport | None = None
-        self._one_client = threading.Lock()
+        self._one_client, self._memory = threading.Lock(), threading.Lock()
         super().__init__(arm, host, port)
         self.interpreter = Interpreter(self.arm, self._program, lambda: self.running and not self._away.is_set())
         self._driver = Driver(self.arm, self.interpreter)
@@ -76,10 +76,11 @@ class EkiController(TcpController):
     def _put(self, message: bytes) -> None:
         """What EthernetKRL does with a message: every element that is there into its FIFO, and the flag."""
         parse_xml(message, self.config.receive[0].path[0])
-        for element, fifo in self.fifos.items():
-            with contextlib.suppress(DeviceError):
-                fifo.append(dissect((element,), message)[element])
-        self.flag2 = True
+        with self._memory:
+            for element, fifo in self.fifos.items():
+                with contextlib.suppress(DeviceError):
+                    fifo.append(dissect((element,), message)[element])
+            self.flag2 = True
 
     # --- WELDSCAN_EKI -------------------------------------------------------------------------------------------------
 
@@ -104,18 +105,18 @@ class EkiController(TcpController):
         self._requests.forget()
 
     def _receive(self) -> Request | None:
-        if not self.flag2:
-            return None
-        self.flag2 = False
-        values = [fifo.popleft() if fifo else None for fifo in self.fifos.values()]  # RET.Read tells which were there
-        left = {len(fifo) for fifo in self.fifos.values()}  # RET.Buff: as many whole messages, or something lacks
+        with self._memory:
+            if not self.flag2:
+                return None
+            values = [fifo.popleft() if fifo else None for fifo in self.fifos.values()]  # RET.Read: which were there
+            left = {len(fifo) for fifo in self.fifos.values()}  # RET.Buff: as many whole messages, or something lacks
+            whole = None not in values and len(left) == 1
+            if not whole:
+                for fifo in self.fifos.values():
+                    fifo.clear()
+            self.flag2 = whole and left != {0}
         number, command, *target = (0.0 if value is None else parse_number(value) for value in values)
-        if None in values or len(left) > 1:
-            for fifo in self.fifos.values():
-                fifo.clear()
-            return Request(int(number), None)
-        self.flag2 = left != {0}
-        return Request(int(number), int(command), KukaPose(*target))
+        return Request(int(number), int(command) if whole else None, KukaPose(*target))
 
     def _reply(self, number: int) -> None:
         """EKI_Set... and EKI_Send, to whoever is there."""

@@ -67,13 +67,13 @@ class Requests:
     ) -> None:
         self._driver, self._receive, self._reply, self._connected = driver, receive, reply, connected
         self._timer = Timer()
-        self._held: Request | None = None
-        """What came while the arm moved, and made it brake."""
         self.forget()
 
     def forget(self) -> None:
-        """Drop what waits for its GO."""
+        """Drop what waits, for its GO or for its turn."""
         self._pending, self.target = 0, NULL_FRAME
+        self._held: Request | None = None
+        """What came while the arm moved, and made it brake."""
         self.left = False
         """Did whoever asked hang up while the arm moved? Somebody else may be there by now."""
 
@@ -99,7 +99,7 @@ class Requests:
                 if driver.look(request.target):
                     self._pending, self.target = request.number, request.target
                     self._timer.set(-1000 * RESPITE_S)
-            case Command.GO if pending == request.number and not self._timer.flag:
+            case Command.GO if pending == request.number != 0 and not self._timer.flag:
                 self._timer.set(-1000 * RESPITE_S)
                 yield from driver.drive(lambda: self._lost(request.number))
             case Command.GO:

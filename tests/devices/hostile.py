@@ -214,6 +214,7 @@ class Proxy:
         self.spoil, self.chance = spoil, random.Random(seed)
         self.on = False
         self._open: set[socket.socket] = set()
+        self._unplugged = False
         self._there = ("127.0.0.1", port)
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
@@ -225,6 +226,7 @@ class Proxy:
 
     def unplug(self) -> None:
         """Hang up on both sides, and let nobody through again."""
+        self._unplugged = True
         self.close()
         for peer in list(self._open):
             with contextlib.suppress(OSError):
@@ -239,6 +241,8 @@ class Proxy:
     def _serve(self, near: socket.socket) -> None:
         with contextlib.suppress(OSError), near, socket.create_connection(self._there, 2.0) as far:
             self._open |= {near, far}
+            if self._unplugged:
+                return
             threading.Thread(target=self._requests, args=(near, far), daemon=True).start()
             last = b""
             while reply := far.recv(65536):

@@ -362,8 +362,6 @@ def test_refused_and_then_right_again(cell, fault):
         assert not isinstance(caught.value, DeviceTimeout), caught.value
     assert robot.name in str(caught.value)
     controller._faults.clear()
-    if fault is LinkFault.JUMP:
-        time.sleep(0.05)  # 400 mm back is a jump too, until there was time for it
     if fault is LinkFault.HUGE and isinstance(controller, SerialController):
         wait_for_quiet_line(robot)
     assert close_to(reads_within(robot, TIMEOUT_S), FLANGE)

@@ -119,7 +119,6 @@ class StreamController(Controller, ABC):
             case LinkFault.BYTES:
                 for byte in reply:
                     yield bytes([byte])
-                    time.sleep(0.0002)
             case LinkFault.TWICE:
                 yield reply + reply
             case LinkFault.GARBAGE:

@@ -44,7 +44,7 @@ class LinkFault(StrEnum):
     """The controller goes away and comes back a second later."""
     NAN = "nan"
     JUMP = "jump"
-    """One pose is 400 mm off."""
+    """One pose is 2 m off."""
     STALE = "stale"
     """The pose stands at what it was, or the stream repeats itself, although the arm moves."""
 
@@ -165,7 +165,7 @@ class Arm:
             self._frozen = (self._frozen or now) if fault is LinkFault.STALE else None
             flange, joints_deg = self._frozen or now
         if fault is LinkFault.JUMP:
-            flange = KukaPose(flange.x_mm + 400.0, *flange.values()[1:])
+            flange = KukaPose(flange.x_mm + 2000.0, *flange.values()[1:])
         position = np.linalg.inv(self.base.matrix()) @ flange.matrix() @ self.tool.matrix()
         return KukaPose.from_matrix(position), joints_deg
 

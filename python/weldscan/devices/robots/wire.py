@@ -181,7 +181,8 @@ class FileTransport:
     def send(self, data: bytes, deadline_s: float) -> None:
         """Send all of it."""
         while data:
-            if not select.select([], [self._fd], [], _remaining(deadline_s))[1]:
+            left_s = _remaining(deadline_s)
+            if left_s == 0.0 or not select.select([], [self._fd], [], left_s)[1]:
                 raise DeviceTimeout("does not take what is sent")
             data = data[os.write(self._fd, data[:1024]) :]
 

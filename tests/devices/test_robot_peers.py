@@ -54,7 +54,8 @@ def answer_rsipi(folder, delay_ms, cycles):
             except OSError:
                 pytest.skip(f"UDP port {port}, which RSIPI wants, is taken")
     options = ["--config", str(config), "--mode", "absolute", "--delay", str(delay_ms), "--timeout-packets", "40"]
-    with RsiRobot(RsiSettings(timeout_s=10.0)) as robot:
+    # Its robot stands at X 0 Y 0 Z 0, where no flange can be: so in a base of its own.
+    with RsiRobot(RsiSettings(timeout_s=10.0, base=(1000.0, 0.0, 1000.0, 0.0, 0.0, 0.0))) as robot:
         server = subprocess.Popen(
             [sys.executable, "-u", "-c", SERVER, *options],
             cwd=folder,

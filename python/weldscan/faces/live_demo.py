@@ -35,6 +35,7 @@ host = "127.0.0.1"         # the controller
 port = 7000
 allow_motion = true        # here nothing can be hit. In a real cell false, until motion is wanted, in T1
 largest_move_mm = 1000.0   # a target further away is refused
+largest_turn_deg = 180.0   # and one that is turned by more
 
 [camera]
 backend = "simulated"      # or "opencv", "aravis", "pylon", "folder"
@@ -81,7 +82,7 @@ def record_live(
         projector = cell.scanner.projector
         config = CellConfig(
             name=cell.name,
-            robot=link | {"allow_motion": True, "largest_move_mm": 10_000.0},
+            robot=link | {"allow_motion": True, "largest_move_mm": 10_000.0, "largest_turn_deg": 180.0},
             camera={"backend": "simulated", "controller": link, "cell": cell},
             projector={"backend": "simulated", "width": projector.width, "height": projector.height},
             scan={"plan": str(path), "still_window_s": 0.05},

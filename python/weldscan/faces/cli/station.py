@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import sys
 import threading
 import time
@@ -339,15 +338,13 @@ def _inject(controller: Controller, request: str) -> None:
 
 
 def _pose(words: list[str]) -> KukaPose:
-    from weldscan.pose import KukaPose
+    from weldscan.pose import KukaPose, parse_number
 
     try:
-        values = [float(word) for word in words]
+        x, y, z, a, b, c = map(parse_number, words)
     except ValueError:
         raise InputError(f"pose: {' '.join(words)!r} is not six numbers") from None
-    if len(values) != 6 or not all(map(math.isfinite, values)):
-        raise InputError(f"pose: {' '.join(words)!r} is not six numbers")
-    return KukaPose(*values)
+    return KukaPose(x, y, z, a, b, c)
 
 
 def _show(pose: StampedPose, to_a_person: bool) -> None:

@@ -77,7 +77,7 @@ def test_a_run_of_stations_that_nobody_read_is_a_gap():
 
 
 def pipe(over_mm):
-    """A pipe of 200 mm with a seam in the middle, seen from outside over 50 degrees, with what lies on the other wall."""
+    """A pipe of 200 mm with a seam, seen from outside over 50 degrees, with what lies on the other wall."""
     around, across = np.meshgrid(np.radians(np.arange(-25, 25, 0.3)), np.arange(-40, 40, 0.4), indexing="ij")
     height = np.where(np.abs(across) < 4, 1.2 * (1 - (across / 4) ** 2), 0.0)
     height = height + np.where(across > 4, over_mm(100 * around, across), 0.0)

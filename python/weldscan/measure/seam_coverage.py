@@ -33,7 +33,7 @@ SATURATED_PART, LOST_PART = 0.50, 0.75
 WAVES_MM = 0.12
 # Stations of two shots read the same place where they share so much of it, in stations.
 SAME_PLACE = 0.6
-# Of what a station reads off its neighbours, if the surfaces beside its toes are off by so much, they and not the toes are.
+# If the surfaces beside its toes are off by this part of what a station reads off its neighbours, so are the walls.
 LOCAL_PART = 0.5
 # So many stations without a reading are a gap: one may be a drop of spatter or a small hole.
 GAP_STATIONS = 1.75

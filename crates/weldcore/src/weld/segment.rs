@@ -364,7 +364,7 @@ pub(crate) mod tests {
             let seen: Vec<[f64; 3]> = e.points().into_iter().filter(|p| p[0].is_finite()).collect();
             // In steps that share no factor with their number, every point comes once.
             let n = seen.len();
-            let step = (n / 3..).find(|s| (2..=*s).all(|f| s % f != 0 || n % f != 0)).unwrap();
+            let step = (n / 3..).find(|s| (2..=*s).all(|f| !(s.is_multiple_of(f) && n.is_multiple_of(f)))).unwrap();
             let cloud: Vec<[f64; 3]> = (0..n).map(|i| seen[i * step % n]).collect();
             let bare = segment(&cloud, 1, &e.nominal()).unwrap();
             let count = |s: &Segmentation, l: Label| s.labels.iter().filter(|x| **x == l as u8).count() as f64;

@@ -77,7 +77,7 @@ pub(super) fn flare(profile: &Profile, foot: Foot, crown: f64, wall: &WallRun) -
         Some(chord(x) - h)
     });
     let [Some(first), Some(middle), Some(third)] = sags else { return None };
-    (first > 0.0 && third > 0.0 && middle > SAG_PART * height).then(|| foot.at + 0.25 * FLANK_WINDOW_MM)
+    (first > 0.0 && third > 0.0 && middle > SAG_PART * height).then_some(foot.at + 0.25 * FLANK_WINDOW_MM)
 }
 
 #[cfg(test)]

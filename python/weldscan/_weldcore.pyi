@@ -53,6 +53,7 @@ __all__ = [
     "height_from_reference",
     "measure_step",
     "misalignment",
+    "outside_calibration",
     "phase_error_of_harmonics",
     "place_shots",
     "quadric_distances",

@@ -364,7 +364,9 @@ def seam_of(
     """
     measured, course = set(measured), views[0].shot.seam.course
     tables = [seam_fates(view.shot, np.ascontiguousarray(view.reason), scanner) for view in views]
-    every = np.sum([table for table, _, _ in tables], axis=0, dtype=np.int64)
+    every: NDArray[np.int64] = np.zeros((course.bins, len(FATES)), np.int64)
+    for table, _, _ in tables:
+        every += table
     at_weld = [near for _, near, _ in tables]
     expected = expected_bins(views, scanner)
     beside = _beside_read(views, at_weld) & expected

@@ -25,7 +25,7 @@ const SAG_PART: f64 = 0.1;
 
 /// The outermost place where a flank is as steep as anywhere.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Foot {
+pub(super) struct FlankFoot {
     pub at: f64,
     /// Of the surface there.
     pub height: f64,
@@ -34,7 +34,7 @@ pub(super) struct Foot {
 }
 
 /// The foot of a flank that flattens before its `toe`; `far` is the other toe, `sign` −1 for hollow caps.
-pub(super) fn foot(profile: &Profile, toe: f64, far: f64, sign: f64, sigma: f64) -> Option<Foot> {
+pub(super) fn foot(profile: &Profile, toe: f64, far: f64, sign: f64, sigma: f64) -> Option<FlankFoot> {
     let (from, to) = (profile.boundary(0.5 * (toe + far)), profile.boundary(toe - ROUNDED_MM));
     let window = profile.in_bins(FLANK_WINDOW_MM).max(3);
     if to < from + 2 * window {
@@ -57,11 +57,11 @@ pub(super) fn foot(profile: &Profile, toe: f64, far: f64, sign: f64, sigma: f64)
         return None;
     }
     let (_, height) = profile.mean(at.saturating_sub(1), (at + 1).min(profile.len()))?;
-    Some(Foot { at: x, height, slope: most })
+    Some(FlankFoot { at: x, height, slope: most })
 }
 
 /// Where the wall ends, if what runs out beyond a foot is its flare and no toe of a cap.
-pub(super) fn flare(profile: &Profile, foot: Foot, crown: f64, wall: &WallRun) -> Option<f64> {
+pub(super) fn flare(profile: &Profile, foot: FlankFoot, crown: f64, wall: &WallRun) -> Option<f64> {
     let (begin, end) = (profile.boundary(foot.at), profile.boundary(wall.from));
     let tail = wall.from - foot.at;
     let height = foot.height - wall.straight(foot.at);

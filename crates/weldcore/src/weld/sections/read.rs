@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use super::cap::Candidate;
 use super::direction::Direction;
-use super::foot::{self, Foot};
+use super::foot::{self, FlankFoot};
 use super::station::{Edge, Kind, Station, running_median};
 use super::toes::Toe;
 use super::view::{FLUSH_GAP_MM, Found, View};
@@ -322,7 +322,7 @@ impl View<'_> {
             .sum()
     }
 
-    fn foot_of(&self, k: usize, found: &Found, toes: &[Toe; 2], side: usize) -> Option<Foot> {
+    fn foot_of(&self, k: usize, found: &Found, toes: &[Toe; 2], side: usize) -> Option<FlankFoot> {
         let sign = if found.kind == Kind::Hollow { -1.0 } else { 1.0 };
         let [toe, far] = if side == 0 { [-toes[0].at, -toes[1].at] } else { [toes[1].at, toes[0].at] };
         foot::foot(&self.smooth[k][side], toe, far, sign, self.sigma)

@@ -65,18 +65,23 @@ class EkiController(TcpController):
             return
         assert isinstance(transport, TcpTransport)
         with self._one_client:
-            self._client, self.flag1 = transport, True
+            with self._memory:
+                self._client, self.flag1 = transport, True
             messages = Messages(transport, self.cut)
             with contextlib.suppress(DeviceError, OSError, ValueError):
                 while not self._stop.is_set():
                     with contextlib.suppress(DeviceTimeout):
-                        self._put(messages.next(time.monotonic() + LOOK_S))
-            self._client, self.flag1 = None, False
+                        self._put(transport, messages.next(time.monotonic() + LOOK_S))
+            with self._memory:
+                if self._client is transport:
+                    self._client, self.flag1 = None, False
 
-    def _put(self, message: bytes) -> None:
+    def _put(self, transport: TcpTransport, message: bytes) -> None:
         """What EthernetKRL does with a message: every element that is there into its FIFO, and the flag."""
         parse_xml(message, self.config.receive[0].path[0])
         with self._memory:
+            if self._client is not transport:
+                return
             for element, fifo in self.fifos.items():
                 with contextlib.suppress(DeviceError):
                     fifo.append(dissect((element,), message)[element])
@@ -95,14 +100,18 @@ class EkiController(TcpController):
             self._open_anew()
 
     def _open_anew(self) -> None:
-        """EKI_Close, EKI_ClearBuffer, $FLAG[2]=FALSE, EKI_Open: whoever comes next finds nothing of those before."""
-        client = self._client
-        if client is not None:
-            client.close()
-        for fifo in self.fifos.values():
-            fifo.clear()
-        self.flag2 = False
-        self._requests.forget()
+        """EKI_Close, EKI_ClearBuffer, $FLAG[2]=FALSE, EKI_Open: whoever comes next finds nothing of those before.
+
+        At once: between EKI_Close and EKI_Open nobody is connected, so that nobody's request is cleared away unheard.
+        """
+        with self._memory:
+            if self._client is not None:
+                self._client.close()
+                self._client, self.flag1 = None, False
+            for fifo in self.fifos.values():
+                fifo.clear()
+            self.flag2 = False
+            self._requests.forget()
 
     def _receive(self) -> Request | None:
         with self._memory:

@@ -1,23 +1,36 @@
-"""Figures of the live cell: poses per second, the worst of many, and the time from a pattern to its frame.
+"""Figures of the live cell: poses per second, the worst of many, the time from a pattern to its frame, and of a shot.
 
 python benches/live_cell.py [POSES]     (10,000 by default)
+python benches/live_cell.py shots       (only the time of a shot)
 
-Every pose is compared with what the simulated controller holds before it is counted.
+Every pose is compared with what the simulated controller holds before it is counted, every shot is whole.
 """
 
 from __future__ import annotations
 
+import json
+import os
 import shutil
 import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
-from weldscan import KukaPose
+from weldscan import DeviceError, KukaPose
 from weldscan.devices import backend
 from weldscan.devices.projectors.patterns import fringe_patterns
 from weldscan.devices.robots import Robot, distance
+from weldscan.records.shot import left_out
+from weldscan.simulated import DEFAULT, session_document
 from weldscan.simulated.controllers import Arm
+from weldscan.simulated.controllers.kvp import KvpController
+from weldscan.station.cell import CellConfig
+from weldscan.station.scan import scan
 
 FLANGE = KukaPose(610.825, -148.476, 481.652, -29.008, 23.236, 74.641)
 TOOL = KukaPose(12.5, -3.25, 180.0, 15.0, -40.0, 5.0)
@@ -55,16 +68,28 @@ def links(count: int) -> None:
         print(f"{'':16} of {controller.cycles} cycles {controller.late} answers late, {controller.wrong} wrong")
 
 
-def frames(count: int = 200) -> None:
-    """Aravis's fake camera: from the pattern that was shown to its frame, without the projector's latency."""
+@contextmanager
+def fake_gige() -> Iterator[str | None]:
+    """Aravis's fake camera, by its name; None where it is not installed."""
     if shutil.which("arv-fake-gv-camera-0.8") is None:
         print("arv-fake-gv-camera-0.8 is not installed")
+        yield None
         return
     fake = subprocess.Popen(["arv-fake-gv-camera-0.8", "-i", "127.0.0.1", "-s", "WELD01"], stderr=subprocess.DEVNULL)
     try:
         time.sleep(1.0)
+        yield next(name for name in backend("camera", "aravis").available() if "WELD01" in name)
+    finally:
+        fake.kill()
+        fake.wait()
+
+
+def frames(count: int = 200) -> None:
+    """Aravis's fake camera: from the pattern that was shown to its frame, without the projector's latency."""
+    with fake_gige() as name:
+        if name is None:
+            return
         camera, projector = backend("camera", "aravis"), backend("projector", "simulated")
-        name = next(name for name in camera.available() if "WELD01" in name)
         settings = camera.Settings(device=name, width=1280, height=960, exposure_s=0.005, timeout_s=5.0)
         patterns = list(fringe_patterns([("x", 64, 4)], 1280, 800))
         times = []
@@ -79,11 +104,48 @@ def frames(count: int = 200) -> None:
             f"{'pattern to frame':16} median {statistics.median(times) * 1000:6.2f} ms   worst of {count} "
             f"{max(times) * 1000:7.2f} ms, 5 ms of it exposure"
         )
-    finally:
-        fake.kill()
-        fake.wait()
+
+
+def shots() -> None:
+    """A shot of 12 patterns and white, 1280x960, exposed for one refresh of 60 Hz: where its time goes."""
+    os.environ["PYLON_CAMEMU"] = "1"
+    common = {"width": 1280, "height": 960, "exposure_s": 1 / 60, "timeout_s": 20.0}
+    with fake_gige() as name:
+        aravis = {"backend": "aravis", "device": name, "packet_size": 32_000}
+        for camera in ({"backend": "simulated"}, aravis if name else {}, {"backend": "pylon"}):
+            try:
+                if camera:
+                    a_shot(common | camera)
+            except DeviceError as error:
+                print(f"{camera['backend']:16} {error}")
+
+
+def a_shot(camera: dict[str, Any]) -> None:
+    """The plan of the demo, through one camera."""
+    plan = session_document(DEFAULT)
+    arm = Arm(KukaPose(*plan["shots"][0]["flange_pose"].values()))
+    arm.speed_mm_s, arm.turn_speed_deg_s = 5000.0, 1000.0
+    with KvpController(arm) as controller, TemporaryDirectory(dir=".") as folder:
+        (Path(folder) / "plan.json").write_text(json.dumps(plan))
+        link = {"link": "kvp", "port": controller.port}
+        cell = CellConfig(
+            robot=link | {"allow_motion": True, "largest_move_mm": 10_000.0},
+            camera=camera | ({"controller": link} if camera["backend"] == "simulated" else {}),
+            projector={"backend": "simulated", "width": 1280, "height": 800, "refresh_hz": 60.0},
+            # What the other two see is no scene of ours.
+            scan={"plan": str(Path(folder) / "plan.json"), "least_usable": 0.0, "most_saturated": 1.0},
+        )
+        result = scan(cell, Path(folder) / "out")
+        if result.whole != len(plan["shots"]) or left_out(result.folder):
+            raise SystemExit(f"{camera['backend']}: {result}")
+        shot = {what: seconds / result.whole for what, seconds in result.seconds.items()}
+        images = sum(shot[what] for what in ("projector", "camera", "judging"))
+        parts = ", ".join(f"{what} {seconds:.2f}" for what, seconds in shot.items())
+        print(f"{camera['backend']:16} {images:5.2f} s for the images of a shot; in all {parts}")
 
 
 if __name__ == "__main__":
-    links(int(sys.argv[1]) if len(sys.argv) > 1 else 10_000)
-    frames()
+    if sys.argv[1:] != ["shots"]:
+        links(int(sys.argv[1]) if len(sys.argv) > 1 else 10_000)
+        frames()
+    shots()

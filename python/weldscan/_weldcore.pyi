@@ -54,6 +54,7 @@ __all__ = [
     "label_weld",
     "measure_step",
     "misalignment",
+    "outside_calibration",
     "phase_error_of_harmonics",
     "place_shots",
     "quadric_distances",
@@ -170,7 +171,11 @@ def decode(
     phase_error: Literal["auto"] | Sequence[Sequence[float] | None] | None = None,
 ) -> PhaseMap: ...
 def capture_quality(
-    exposures: Sequence[Sequence[NDArray[Any]]], first: int, steps: int, least_modulation: float
+    exposures: Sequence[Sequence[NDArray[Any]]],
+    first: int,
+    steps: int,
+    least_modulation: float,
+    full_scale: int | None = None,
 ) -> tuple[float, float, float, float]: ...
 def saturation_level(images: Sequence[NDArray[Any]] | NDArray[Any]) -> tuple[float, float, bool]: ...
 
@@ -249,6 +254,9 @@ def height_from_reference(
     calibration: ReferencePlane | None = None,
 ) -> NDArray[np.float64]: ...
 def triangulate(column: ArrayLike, scanner: Scanner, sigma_px: ArrayLike | None = None, axis: str = "x") -> Cloud: ...
+def outside_calibration(
+    points_mm: NDArray[np.float64], scanner: Scanner, camera_px: ArrayLike, projector_px: ArrayLike
+) -> NDArray[np.bool_]: ...
 def sphere_caps(
     lens: Lens, centres_mm: ArrayLike, radius_mm: float
 ) -> list[tuple[NDArray[np.int64], NDArray[np.float64], int]]: ...
@@ -600,7 +608,7 @@ class WeldShot:
 
 def seam_fates(
     shot: WeldShot, reason: NDArray[np.uint8], scanner: Scanner
-) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]: ...
+) -> tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32]]: ...
 def segment_weld(
     points_mm: ArrayLike,
     radius_mm: float,

@@ -11,6 +11,10 @@ class InputError(WeldscanError, ValueError):
     """A file, a field or an argument is wrong: missing, of the wrong shape, not finite, out of range."""
 
 
+class Unreadable(InputError):
+    """A file or folder is there, but the system did not give its contents: nothing is known about them."""
+
+
 class GeometryError(WeldscanError, ValueError):
     """The data do not determine what was asked for: too few points, degenerate, not found."""
 

@@ -24,14 +24,43 @@ LOCK_COS_B = 1e-6
 ROTATION_TOLERANCE = 1e-5
 """How far R R^T may stand from the identity: matrices kept in single precision are off by 1e-6."""
 
-_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-_STRUCT = re.compile(r"\{\s*(?:([A-Za-z]\w*)\s*:)?([^{}:]*)\}")
-_FIELD = re.compile(rf"([A-Za-z]\w*)\s+({_NUMBER})")
+_NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+_WHOLE = r"[+-]?[0-9]{1,18}"
+_STRUCT = re.compile(r"\{\s*(?:([A-Za-z]\w*)\s*:)?([^{}:]*)\}", re.ASCII)
+_FIELD = re.compile(r"([A-Za-z]\w*)\s+(\S+)", re.ASCII)
 _POSE = ("X", "Y", "Z", "A", "B", "C")
 _AXES = ("A1", "A2", "A3", "A4", "A5", "A6")
 _EXTERNAL = ("E1", "E2", "E3", "E4", "E5", "E6")
 _LONGEST = 1000
 """Characters: the longest structure that a controller prints has about 200."""
+
+
+def parse_number(text: str) -> float:
+    """Return the number that a whole text is, as controllers and people write it: ASCII digits, a point, an exponent.
+
+    Raises `InputError` for what Python would take besides (`5_0_0`, other scripts' digits, blanks, `nan`, `inf`) and
+    for what does not fit into a double.
+
+    >>> from weldscan.pose import parse_number
+    >>> parse_number("-12.5e1")
+    -125.0
+    """
+    number = float(text) if re.fullmatch(_NUMBER, text) else math.nan
+    if not math.isfinite(number):
+        raise InputError(f"{text[:40]!r} is not a number")
+    return number
+
+
+def parse_whole(text: str) -> int:
+    """Return the whole number that a whole text is, in ASCII digits; raises `InputError` for anything else.
+
+    >>> from weldscan.pose import parse_whole
+    >>> parse_whole("0042")
+    42
+    """
+    if not re.fullmatch(_WHOLE, text):
+        raise InputError(f"{text[:40]!r} is not a whole number")
+    return int(text)
 
 
 def matrix_from_kuka(x_mm: float, y_mm: float, z_mm: float, a_deg: float, b_deg: float, c_deg: float) -> Floats:
@@ -196,11 +225,13 @@ def _numbers(text: str, types: tuple[str, ...], needed: tuple[str, ...], allowed
         field = _FIELD.fullmatch(item.strip())
         if field is None:
             raise InputError(f"pose: {item.strip()!r} in {shown} is not a name and a number")
-        name, value = field[1].upper(), float(field[2])
+        name = field[1].upper()
+        try:
+            value = parse_number(field[2])
+        except InputError as error:
+            raise InputError(f"pose: {name} in {shown}: {error}") from None
         if name in fields or name not in needed + allowed:
             raise InputError(f"pose: field {name} in {shown} is {'given twice' if name in fields else 'unknown'}")
-        if not math.isfinite(value):
-            raise InputError(f"pose: {name} in {shown} is not a finite number")
         if name in _EXTERNAL and value != 0:
             raise InputError(f"pose: external axis {name} is at {value}; external axes are not supported")
         fields[name] = value

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import time
 from dataclasses import replace
 
 import cv2
@@ -30,13 +31,15 @@ COVERED_IN_12, COVERED_IN_200 = (0.85, 1.0), (0.93, 0.97)
 # --- made-up features -------------------------------------------------------------------------------------------------
 
 
-def seen_from(scanner: Scanner, poses, seed: int, sigma: float = NOISE_PX, columns=9, rows=13, pitch=10.0):
-    """What both devices see of a chessboard, with independent noise."""
+def seen_from(scanner: Scanner, poses, seed: int, sigma: float = NOISE_PX, columns=9, rows=13, pitch=10.0, bowl=0.0):
+    """What both devices see of a chessboard, with independent noise; `bowl` mm deep at its corners."""
     board = parse_board(f"chessboard:{columns}x{rows}:{pitch}mm").points_mm()
+    far = np.square(board).sum(axis=1)
+    shape = board + np.column_stack([0 * far, 0 * far, bowl * far / far.max()])
     random = np.random.default_rng(seed)
     out = []
     for i, pose in enumerate(poses):
-        points = board @ pose[:3, :3].T + pose[:3, 3]
+        points = shape @ pose[:3, :3].T + pose[:3, 3]
         camera, projector = scanner.camera.project(points), scanner.project_to_projector(points)
         size = np.array([scanner.camera.width, scanner.camera.height]) - 1
         kept = ((camera >= 0) & (camera <= size)).all(axis=1)
@@ -97,7 +100,8 @@ def test_stated_intervals_hold_the_truth(soak):
     for seed in range(runs):
         found = solve_scanner(seen_from(scanner, good_poses(12), seed), *sizes(scanner))
         assert found.undetermined == ()
-        assert found.board_sigma_mm is None
+        # A flat board is taken for another once in a hundred times, and comes out flat.
+        assert found.board_sigma_mm is None or max(found.board_sigma_mm) < 0.003
         z.append(in_sigmas(found, scanner))
         worst.append(shape_error_mm(found.scanner, scanner))
     low, high = COVERED_IN_200 if soak else COVERED_IN_12
@@ -111,7 +115,7 @@ def test_stated_uncertainty_of_points_is_what_they_scatter_by():
     scanner = make_scanner()
     found = [solve_scanner(seen_from(scanner, good_poses(8), seed), *sizes(scanner)) for seed in range(10)]
     scatter = np.sqrt(np.mean([np.square(shape_error_mm(f.scanner, scanner)).mean() for f in found]))
-    stated = np.mean([np.linalg.norm(f.volume[0].shape_u_mm) for f in found])
+    stated = np.median([np.linalg.norm(f.volume[0].shape_u_mm) for f in found])
     assert 0.3 < stated / scatter < 3  # the middle against the rms of all: the same order, not another unit
 
 
@@ -142,6 +146,23 @@ def test_derivatives_are_those_of_differences(device):
         slope = (up - down) / 2e-6
         good = np.isfinite(slope)
         assert rows.by_pose[:, column, :, i][good] == pytest.approx(slope[good], rel=1e-4, abs=1e-3)
+
+
+def test_derivatives_by_the_board_are_those_of_differences():
+    scanner = make_scanner()
+    from weldscan.calibration.scanner import _features
+
+    f = _features(seen_from(scanner, good_poses(3), 1))
+    f = replace(f, slope=np.random.default_rng(0).normal(0, 1, f.slope.shape))
+    model = bundle.start(f, *sizes(scanner))
+    rows = bundle.rows_of(model, f)
+    for i in range(8):
+        off, shape = 1e-4 * np.eye(8)[i], np.zeros_like(model.shape)
+        shape[:] = off[5:]
+        up, down = (bundle.rows_of(replace(model, bends=s * off[:5], shape=s * shape), f).residuals for s in (1, -1))
+        slope = (up - down) / 2e-4
+        good, column = np.isfinite(slope), bundle.BEND.start + i
+        assert rows.design[..., column][good] == pytest.approx(slope[good], rel=1e-4, abs=1e-5)
 
 
 def test_point_derivatives_move_points_as_the_parameters_do():
@@ -212,6 +233,100 @@ def test_a_board_that_is_not_as_drawn_is_solved_for():
     assert found.sigma_px == pytest.approx((0.05, 0.05), rel=0.1)
     assert taken_as_flat.sigma_px[0] > 2 * found.sigma_px[0]
     assert np.abs(in_sigmas(found, scanner)).max() < 4.5
+
+
+@pytest.mark.parametrize("bowl", [0.02, 0.1, 0.2])
+def test_a_bowed_board_is_solved_for(bowl):
+    """A bow hides in the lenses: it bends them by many sigmas before any residual looks odd."""
+    scanner = make_scanner()
+    seen = seen_from(scanner, good_poses(10), 1, sigma=0.05, bowl=bowl)
+    found = solve_scanner(seen, *sizes(scanner))
+    assert found.board_sigma_mm is not None
+    # A bowl's rms, freed of its mean.
+    assert found.board_sigma_mm[1] == pytest.approx(0.265 * bowl, rel=0.1)
+    assert np.square(in_sigmas(found, scanner)).mean() < 3
+    assert shape_error_mm(found.scanner, scanner).max() < 0.01
+    taken_as_flat = solve_scanner(seen, *sizes(scanner), board_shape=False)
+    assert np.square(in_sigmas(taken_as_flat, scanner)).mean() > 8
+
+
+@pytest.mark.parametrize("board_sigma", [None, (0.01, 0.04)])
+@pytest.mark.parametrize("twice", [False, True])
+def test_normal_equations_are_those_of_the_whole_matrix(board_sigma, twice):
+    """Sums by view and feature, blocks eliminated, against one dense matrix of all rows and unknowns."""
+    from weldscan.calibration.scanner import _features
+
+    scanner, random = make_scanner(), np.random.default_rng(3)
+    seen = seen_from(scanner, good_poses(6), 2, columns=5, rows=4, pitch=25.0)
+    seen[1].projector_px[3] = math.nan
+    if twice:
+        two = [np.concatenate([a, a[:2]]) for a in (seen[0].board_mm, seen[0].camera_px, seen[0].projector_px)]
+        seen[0] = BoardView("p0", *two)
+    f = _features(seen)
+    f = replace(f, slope=random.normal(0, 1, f.slope.shape), relative_sigma=1 + random.random(len(f.view)))
+    first = bundle.start(f, *sizes(scanner))
+    first = replace(first, shape=random.normal(0, 0.02, first.shape.shape))
+    priors, free = bundle.prior_sigmas(first, *sizes(scanner)), np.array([i for i in range(24) if i not in bundle.K3])
+    p, rows = bundle._problem(f, first, priors, free, board_sigma), bundle.rows_of(first, f)
+    common = np.concatenate([free, np.arange(bundle.BEND.start, bundle.BEND.stop)]) if board_sigma else free
+    few = len(common)
+    weight = random.random((len(f.view), 2)) + 0.5
+    weight[~f.seen, 1] = 0
+    places = 3 * len(first.shape) if board_sigma else 0
+    first = replace(first, bends=random.normal(0, 0.1, 5) if board_sigma else np.zeros(5))
+
+    def dense(views):
+        n = len(f.view)
+        whole = np.zeros((n, 4, few + 6 * len(views) + places))
+        for i in range(n):
+            if f.view[i] not in views:
+                continue
+            whole[i, :, :few] = rows.design[i].reshape(4, -1)[:, common]
+            at = few + 6 * views.index(f.view[i])
+            whole[i, :, at : at + 6] = rows.by_pose[i].reshape(4, -1)
+            if places:
+                at = few + 6 * len(views) + 3 * f.number[i]
+                whole[i, :, at : at + 3] = rows.by_point[i].reshape(4, -1)
+        whole *= np.sqrt(np.repeat(weight, 2, axis=1))[..., None]
+        right = (np.nan_to_num(rows.residuals) * np.sqrt(weight)[..., None]).ravel()
+        whole = whole.reshape(4 * n, -1)
+        matrix, gradient = whole.T @ whole, whole.T @ right
+        matrix[range(len(free)), range(len(free))] += priors[free] ** -2.0
+        if places:
+            widths = np.tile([board_sigma[0], board_sigma[0], board_sigma[1]], len(first.shape))
+            matrix[range(few - 5, few), range(few - 5, few)] += bundle.BEND_MM**-2.0
+            gradient[few - 5 : few] += first.bends / bundle.BEND_MM**2
+            matrix[-places:, -places:] += np.diag(widths**-2.0)
+            gradient[-places:] += first.shape.ravel() / widths**2
+        size = np.sqrt(np.diag(matrix))
+        inverse = np.linalg.inv(matrix / np.outer(size, size)) / np.outer(size, size)
+        return inverse, -inverse @ gradient
+
+    sums = bundle._sums(p, rows, weight)
+    inverse, wanted = dense([0, 1, 2, 3, 4, 5])
+    u = np.sqrt(np.diag(inverse))
+    normal = bundle._normal(p, sums).with_priors(p, first)
+    core, blocks, _ = bundle._step(normal, 0.0)
+    assert np.abs(np.concatenate([core, blocks.ravel()]) - wanted) / u == pytest.approx(0, abs=1e-8)
+    size = len(core)
+    got = bundle.inverse_of(normal.reduced())
+    assert np.abs(got - inverse[:size, :size]) / np.outer(u[:size], u[:size]) == pytest.approx(0, abs=1e-8)
+    left_out = bundle._without(p, first, sums)[2, free]
+    assert np.abs(left_out - dense([0, 1, 3, 4, 5])[1][: len(free)]) / u[: len(free)] == pytest.approx(0, abs=1e-8)
+
+
+def test_an_adjustment_is_quick_and_wakes_no_threads():
+    """12 poses of 147 features and a bowed board: many small products, which BLAS must not share out."""
+    scanner = make_scanner()
+    seen = seen_from(scanner, good_poses(12), 0, columns=21, rows=7, pitch=7.0, bowl=0.2)
+    solve_scanner(seen, *sizes(scanner))
+    process, thread = time.process_time(), time.thread_time()
+    found = solve_scanner(seen, *sizes(scanner))
+    process, thread = time.process_time() - process, time.thread_time() - thread
+    assert found.board_sigma_mm is not None
+    # 0.3 s on an idle machine, where it took 12; a machine at work takes twice as long for anything.
+    assert thread < 2.0
+    assert process < 1.4 * thread
 
 
 # --- through images ---------------------------------------------------------------------------------------------------

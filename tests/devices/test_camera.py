@@ -292,6 +292,84 @@ def test_opencv_gives_no_frame_from_before_the_question(scene, request, monkeypa
             assert camera.capture().image[0, 0] > int(asked) % 256 or asked > 250
 
 
+class Uvc(V4l2):
+    """A camera that streams whether asked or not, with a queue of 4; its frames take a while to come over USB."""
+
+    period_s, exposure_s, transfer_s = 1 / 60, 0.002, 0.06
+    wall = None
+    """What it looks at: grey levels by the time from which they are there."""
+
+    def __init__(self, device, api):
+        super().__init__(device, api)
+        self.queue, self.count, self.begun_s = [], 0, 0.0
+
+    def due_s(self):
+        return self.start_s + self.count * self.period_s + self.exposure_s + self.transfer_s
+
+    def fill(self):
+        while self.due_s() <= time.monotonic():
+            if len(self.queue) < 4:
+                self.queue.append(self.start_s + self.count * self.period_s)
+            self.count += 1
+
+    def grab(self):
+        self.fill()
+        while not self.queue:
+            time.sleep(max(self.due_s() - time.monotonic(), 0) + 1e-4)
+            self.fill()
+        self.begun_s = self.queue.pop(0)
+        return True
+
+    def retrieve(self):
+        middle_s = self.begun_s + self.exposure_s / 2
+        level = next((level for on_s, level in reversed(self.wall or []) if on_s <= middle_s), 0)
+        return True, np.full((4, 6), level, np.uint8)
+
+
+@pytest.mark.parametrize(("exposure_s", "transfer_s"), [(0.002, 0.06), (0.005, 0.03), (1 / 60, 0.033)])
+def test_no_frame_of_a_usb_camera_began_before_the_question(monkeypatch, exposure_s, transfer_s):
+    monkeypatch.setattr(cv2, "VideoCapture", Uvc)
+    monkeypatch.setattr(Uvc, "exposure_s", exposure_s)
+    monkeypatch.setattr(Uvc, "transfer_s", transfer_s)
+    camera = backend("camera", "opencv")
+    with camera(camera.Settings(exposure_s=exposure_s)) as device:
+        for pause_s in (0.0, 0.02, 0.09, 0.1, 0.17):
+            time.sleep(pause_s)
+            asked_s = time.monotonic()
+            device.capture()
+            assert device._capture.begun_s >= asked_s
+
+
+def test_how_long_frames_are_under_way_is_measured(monkeypatch):
+    from weldscan.devices.projectors import Projector, ProjectorSettings
+    from weldscan.station import check
+
+    class Beam(Projector):
+        name, settings = "beam", ProjectorSettings(latency_s=0.0, guard_frames=0, width=8, height=8)
+
+        def _show(self, image):
+            now_s = time.monotonic()
+            Uvc.wall.append((now_s, 20 + int(image[0, 0]) // 2))
+            return now_s
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(cv2, "VideoCapture", Uvc)
+    monkeypatch.setattr(Uvc, "wall", [])
+    monkeypatch.setattr(check, "REST_S", 0.0)
+    camera = backend("camera", "opencv")
+    with camera(camera.Settings(exposure_s=0.002)) as device:
+        found = check.transfer_s(device, Beam(), 3)
+    assert min(found) >= Uvc.transfer_s
+    assert min(found) < Uvc.transfer_s + 2 * Uvc.period_s + 0.05
+    with camera(camera.Settings(exposure_s=0.002, transfer_s=max(found))) as device:
+        for _ in range(5):
+            asked_s = time.monotonic()
+            device.capture()
+            assert device._capture.begun_s >= asked_s
+
+
 def test_opencv_settings_that_are_not_taken(monkeypatch):
     camera = backend("camera", "opencv")
     for key in (cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_GAIN, cv2.CAP_PROP_FRAME_WIDTH):
@@ -366,6 +444,42 @@ def test_torn_frames_are_retried_and_never_given():
     assert frame.image is good
     with pytest.raises(DeviceError, match="4 torn frames"):
         Broken([TornFrame("x")] * 9).capture()
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_a_frame_carries_its_full_scale(bits):
+    full = 2**bits - 1
+    dark, bright = np.full((4, 6), 201, np.uint16), np.full((4, 6), full, np.uint16)
+    told = Broken([dark, bright], bits=bits)
+    assert [told.capture().full_scale for _ in range(2)] == [full, full]
+    seen = Broken([dark, bright, dark])
+    assert [seen.capture().full_scale for _ in range(3)] == [255, full, full]
+    shifted = Broken([bright << (16 - bits)])
+    assert shifted.capture().full_scale == full << (16 - bits)
+    assert Broken([dark.astype(np.uint8)]).capture().full_scale == 255
+
+
+def test_a_number_beyond_the_full_scale_is_no_frame():
+    with pytest.raises(DeviceError, match="5000, beyond the full scale of 4095"):
+        Broken([np.full((4, 6), 5000, np.uint16)], bits=12).capture()
+
+
+@pytest.mark.parametrize("name", ["aravis", "pylon"])
+@pytest.mark.parametrize("bits", [10, 12])
+def test_the_pixel_format_says_the_full_scale(name, bits, scene, request, monkeypatch):
+    if name == "aravis":
+        pytest.skip("the fake camera has 8 and 16 bits")
+    with open_camera(name, scene, request, monkeypatch, pixel_format=f"Mono{bits}") as camera:
+        frame = camera.capture()
+        assert (frame.image.dtype, frame.full_scale) == (np.uint16, 2**bits - 1)
+
+
+def test_what_is_dark_for_twelve_bits_is_dark():
+    from weldscan.station.check import overlay
+
+    frame = Broken([np.array([[180, 2000, 4095]], np.uint16)], bits=12).capture()
+    blue, grey, red = overlay(frame)[0].tolist()
+    assert (blue, grey, red) == ([160, 0, 0], [124, 124, 124], [0, 0, 255])
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from weldscan import KukaPose
+from conftest import shared
+from weldscan import KukaPose, parse_e6pos
 from weldscan.devices.robots import distance
+from weldscan.devices.robots.kinematics import ArmGeometry
 from weldscan.simulated.controllers import HOME, HOME_JOINTS, Arm, OutOfReach
-from weldscan.simulated.controllers.kinematics import ArmGeometry
 
 ARM = ArmGeometry()
 MM = 1e-4
@@ -51,6 +52,15 @@ def test_a1_a4_and_a6_turn_against_their_axis():
     assert ARM.flange((*upright, 90.0, 90.0, 0.0))[:3, 2] == pytest.approx([0.0, -1.0, 0.0], abs=1e-12)
     s, c = sine_cosine(30.0)
     assert ARM.flange((*upright, 0.0, 0.0, 30.0))[:3, 0] == pytest.approx([0.0, -s, -c], abs=1e-12)
+
+
+def test_a_controllers_own_pose_in_the_home_position():
+    """The fifth of the published strings, whose flange points along Y: what A1 = -90 gives, whatever the lengths."""
+    told = parse_e6pos(shared("robot/strings.txt").read_text().splitlines()[4])
+    held = ARM.flange((-90.0, -90.0, 90.0, 0.0, 0.0, 0.0))
+    assert held[:3, :3] == pytest.approx(told.matrix()[:3, :3], abs=1e-9)
+    assert held[0, 3] == pytest.approx(told.x_mm, abs=1e-9)
+    assert held[1, 3] > 0 < told.y_mm
 
 
 @given(angles, angles)

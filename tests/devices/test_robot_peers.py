@@ -13,6 +13,7 @@ import pytest
 
 from weldscan import KukaPose, parse_e6pos
 from weldscan.devices.robots.rsi import RsiRobot, RsiSettings
+from weldscan.errors import DeviceTimeout
 from weldscan.simulated.controllers import Arm
 from weldscan.simulated.controllers.kvp import KvpController
 
@@ -21,6 +22,7 @@ SERVER = (  # a test that runs in the background has Ctrl-C switched off, and it
     "runpy.run_module('RSIPI.rsi_echo_server', run_name='__main__')"
 )
 BUSY_SHARE = 0.1
+LONG = 1000
 POSE = KukaPose(610.825, -148.476, 481.652, -29.008, 23.236, 74.641)
 
 
@@ -54,7 +56,8 @@ def answer_rsipi(folder, delay_ms, cycles):
             except OSError:
                 pytest.skip(f"UDP port {port}, which RSIPI wants, is taken")
     options = ["--config", str(config), "--mode", "absolute", "--delay", str(delay_ms), "--timeout-packets", "40"]
-    with RsiRobot(RsiSettings(timeout_s=10.0)) as robot:
+    # Its robot stands at X 0 Y 0 Z 0, where no flange can be: so in a base of its own.
+    with RsiRobot(RsiSettings(timeout_s=10.0, base=(1000.0, 0.0, 1000.0, 0.0, 0.0, 0.0))) as robot:
         server = subprocess.Popen(
             [sys.executable, "-u", "-c", SERVER, *options],
             cwd=folder,
@@ -62,12 +65,19 @@ def answer_rsipi(folder, delay_ms, cycles):
             stderr=subprocess.STDOUT,
             text=True,
         )
+        begun_s = time.monotonic()
         try:
             poses = [robot.pose().flange]
             stop = time.monotonic() + 60 + cycles * 0.1
             while robot.answered < cycles and time.monotonic() < stop and server.poll() is None:
                 robot.pose()  # and so learn how many were answered
             poses.append(robot.pose().flange)
+        except DeviceTimeout as error:
+            # What falls behind its own IPOC is refused, and on a busy machine this controller does.
+            took_s = time.monotonic() - begun_s
+            if cycles < LONG and robot.packets * delay_ms / 1000 < 0.95 * took_s:
+                pytest.skip(f"RSIPI fell behind its own clock on this machine: {error}")
+            raise
         finally:
             server.send_signal(signal.SIGINT)
             try:

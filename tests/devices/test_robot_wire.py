@@ -358,18 +358,20 @@ def test_checksum(data):
 
 
 def test_lines():
-    line = encode_line(7, "POSE")
-    assert line == b"7 POSE*%d\r\n" % fletcher_oracle(b"7 POSE")
-    assert decode_line(line) == (7, ["POSE"])
+    line = encode_line(7, [1, 2.5])
+    assert line == b"7,1,2.500000*%d\r\n" % fletcher_oracle(b"7,1,2.500000")
+    assert b" " not in line  # at which a controller may end what it reads
+    assert decode_line(line) == (7, ["1", "2.500000"])
     buffer = bytearray(line + b"8 ")
     assert cut_line(buffer) == line
     assert buffer == b"8 "
     for bad in (
-        line.replace(b"POSE", b"PSOE"),
+        line.replace(b"2.5", b"5.2"),
         line.replace(b"7", b"8"),
-        b"POSE\r\n",
+        b"7,1\r\n",
         b"*\r\n",
         b"x*%d\r\n" % checksum(b"x"),
+        b"1_0,1*%d\r\n" % checksum(b"1_0,1"),
     ):
         with pytest.raises(DeviceError):
             decode_line(bad)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from weldscan import segment_weld
-from weldscan.measure.seam_coverage import _of_gaps, edge_profile
+from weldscan.measure.seam_coverage import _of_dark, _of_gaps, edge_profile
 from weldscan.simulated import scenes
 
 
@@ -31,6 +31,7 @@ def view(step, u):
         "edge_standard_mm": np.zeros(len(step)),
         "edge_hull_mm": np.broadcast_to(u, len(step)).astype(float),
         "departure_mm": np.zeros((len(step), 2)),
+        "local_step_mm": np.zeros(len(step)),
     }
     return SimpleNamespace(shot=SimpleNamespace(seam=shot.seam, sections=sections, station_mm=shot.station_mm))
 
@@ -73,3 +74,61 @@ def test_a_run_of_stations_that_nobody_read_is_a_gap():
     # Another shot that read there closes it; and what no view should have seen is none.
     assert _of_gaps([view(three, 0.01), view(read, 0.01)], inside - {max(inside), min(inside)}) == []
     assert _of_gaps([view(three, 0.01)], set()) == []
+
+
+def pipe(over_mm):
+    """A pipe of 200 mm with a seam, seen from outside over 50 degrees, with what lies on the other wall."""
+    around, across = np.meshgrid(np.radians(np.arange(-25, 25, 0.3)), np.arange(-40, 40, 0.4), indexing="ij")
+    height = np.where(np.abs(across) < 4, 1.2 * (1 - (across / 4) ** 2), 0.0)
+    height = height + np.where(across > 4, over_mm(100 * around, across), 0.0)
+    height += np.random.default_rng(4).normal(0, 0.005, height.shape)
+    radius = 100 + height
+    points = np.stack([radius * np.cos(around), radius * np.sin(around), across], axis=2)
+    # The scanner looks along its z, the pipe's axis is its x.
+    return points @ np.array([[0, 0, -1.0], [0, 1, 0], [1, 0, 0]]) + [0, 0, 500.0]
+
+
+def edges(over_mm):
+    shot = segment_weld(pipe(over_mm), 100.0, 3.0, [1.0, 0, 0], [0, 0, -1.0])
+    assert len(shot.sections["along"]) > 15
+    found = edge_profile([SimpleNamespace(shot=shot)])
+    return shot, found
+
+
+def test_a_step_as_short_as_a_station_is_read_and_spatter_is_not():
+    # 8 mm long, wherever the stations begin.
+    for middle in np.arange(0.0, 4.0, 0.5):
+        dent, found = edges(lambda s, z, at=middle: -0.5 * (np.abs(s - at) < 4) * np.exp(-(z - 4) / 15))
+        assert found.worst is not None
+        assert abs(float(found.step_mm[found.worst])) > 0.35, middle
+        assert np.nanmin(dent.sections["local_step_mm"]) <= 0
+    # Metal that lies on the wall beside the toe: 3 mm wide, as high.
+    for middle in (0.0, 1.0, 2.0, 3.0):
+        drop, found = edges(lambda s, z, at=middle: 0.5 * (np.hypot(s - at, z - 6.5) < 1.5))
+        assert found.worst is not None
+        assert abs(float(found.step_mm[found.worst])) < 0.15, middle
+        assert np.nanmax(np.abs(drop.sections["local_step_mm"])) == 0
+
+
+def test_a_dark_stretch_shorter_than_a_bin_is_a_gap():
+    shot = segmented()
+    course = shot.seam.course
+    views = [view(np.full(len(shot.sections["along"]), 0.2), 0.01)]
+    k = int(course.bins_of(np.array([course.at(float(np.median(shot.sections["along"])))]))[0])
+    counted = {k - 1, k, k + 1}
+    per_bin = round(course.along_mm(course.at(course.bin_width)) / (shot.station_mm / 2))
+    assert per_bin > 4
+    cells = np.full((course.bins, per_bin, 2), 100, np.uint32)
+    assert _of_dark(views, [cells], counted) == []
+    one, two = cells.copy(), cells.copy()
+    one[k, 1, 1] = two[k, 1:3, 1] = 2
+    assert _of_dark(views, [one], counted) == []
+    (gap,) = _of_dark(views, [two], counted)
+    assert gap.code == "coverage"
+    assert gap.at_deg == pytest.approx(course.told(course.bin_width * (k - 0.5 + 2 / per_bin)))
+    # Over the border of two bins; another view that saw it; a bin that does not count.
+    border = cells.copy()
+    border[k, -1, 1] = border[k + 1, 0, 1] = 0
+    assert len(_of_dark(views, [border], counted)) == 1
+    assert _of_dark(views * 2, [two, cells], counted) == []
+    assert _of_dark(views, [two], {k - 1}) == []

@@ -24,10 +24,11 @@ from weldscan._weldcore import refuse_masked
 from weldscan.calibration import bundle, volume
 from weldscan.calibration.board import LEAST_FEATURES, Board, find_board, handedness, parse_board
 from weldscan.calibration.captures import Stack, phases_at, read_stack, saturated_share
+from weldscan.calibration.standard_weld import standard_weld
 from weldscan.errors import GeometryError, InputError
 from weldscan.geometry import rigid
 from weldscan.records.capture import MANIFEST, Captures, PoseSpec, read_captures
-from weldscan.result import BoardPose, NextPose, ScannerCalibration, VolumePoint
+from weldscan.result import BoardPose, CalibratedHull, NextPose, ScannerCalibration, VolumePoint
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -49,6 +50,12 @@ MISSING_SHARE = 0.1
 REJECTED_SHARE = 0.05
 LEAST_COVERAGE = 0.5
 PARALLEL_DEG = 10.0
+# So much noise makes of a flat board whose shape is solved for.
+FLAT_MM = 0.003
+# Above this the poses contradict each other by more than chance does.
+CONTRADICTION = 3.0
+# `inspect` bars PASS where less of a wall lies inside the hull of the calibrated pixels.
+LEAST_INSIDE = 0.8
 FIELDS = (8, 6)
 
 
@@ -217,12 +224,14 @@ def solve_scanner(
     f = _features(checked)
     first = bundle.start(f, camera_size, projector_size)
     priors = bundle.prior_sigmas(first, camera_size, projector_size)
-    solved = bundle.solve(f, first, priors, k3=k3)
+    rough = bundle.solve(f, first, priors, k3=k3, rough=True)
     for _ in range(2 if any(view.diameter_mm for view in checked) else 0):
-        f = _without_bias(_features(checked), checked, solved.model)
-        solved = bundle.solve(f, solved.model, priors, k3=k3)
-    if board_shape or (board_shape is None and bundle.repeats(f, solved)):
-        solved = bundle.solve_with_board(f, solved, k3=k3)
+        f = _without_bias(_features(checked), checked, rough.model)
+        rough = bundle.solve(f, rough.model, priors, k3=k3, rough=True)
+    if board_shape or (board_shape is None and bundle.repeats(f, rough)):
+        solved = bundle.solve_with_board(f, rough)
+    else:
+        solved = bundle.solve(f, rough.model, priors, k3=k3)
     return _result(checked, f, solved, linked, camera_size, projector_size, board, temperature_c, valid_days, date)
 
 
@@ -433,17 +442,25 @@ def _result(
     toward = -model.turn.T @ model.shift
     axis = "x" if abs(toward[0]) >= abs(toward[1]) else "y"
     where = volume.volume_of(model, f, projector_size)
-    u, shape_u = volume.uncertainties(model, where, solved.covariance, axis)
     jacobian = volume.rigid_part(where.points) @ volume.point_jacobian(model, where.points, axis).reshape(-1, 24)
     moved = (solved.without @ jacobian.T).reshape(len(views), -1, 3)
     left_out_mm = np.sqrt(np.square(moved).sum(axis=2).mean(axis=1))
-    jackknife = _root_mean(np.square(moved - moved.mean(axis=0)).sum(axis=2).sum(axis=0) * (1 - 1 / len(views)))
+    share = 1 - 1 / len(views)
+    jackknife = _root_mean(np.square(moved - moved.mean(axis=0)).sum(axis=2).sum(axis=0) * share)
+    _, by_noise = volume.uncertainties(model, where, solved.covariance, axis)
+    shape = _root_mean(np.square(by_noise).sum(axis=1))
+    # What the poses contradict each other by is uncertainty too, whatever the noise of the features says.
+    told = len(views) > bundle.LEAST_VIEWS
+    ratio = jackknife / shape if told else None
+    scaled = solved.scaled(max(1.0, ratio or 1.0))
+    u, shape_u = volume.uncertainties(model, where, scaled.covariance, axis)
+    apart = solved.without - solved.without.mean(axis=0)
+    spread = np.sqrt(np.maximum(np.diag(scaled.covariance), np.square(apart).sum(axis=0) * share))
     poses = tuple(_pose(view, f, solved, i, float(left_out_mm[i])) for i, view in enumerate(views))
     camera_used, projector_used = solved.used[:, 0], solved.used[:, 1] & f.seen
     rms = _rms(solved.camera_residual_px, camera_used), _rms(solved.projector_residual_px, projector_used)
     both = np.concatenate([solved.camera_residual_px[camera_used], solved.projector_residual_px[projector_used]])
-    shape = _root_mean(np.square(shape_u).sum(axis=1))
-    undetermined = _undetermined(model, solved.covariance, free, camera_size, projector_size)
+    undetermined = _undetermined(model, spread, scaled.covariance, free, camera_size, projector_size)
     coverage = tuple(
         _coverage(pixels, size)
         for pixels, size in ((f.camera_px, camera_size), (f.projector_px[f.seen], projector_size))
@@ -451,7 +468,8 @@ def _result(
     when = date or datetime.now(UTC)
     turn = cv2.Rodrigues(model.turn)[0].ravel()
     values = np.concatenate([model.camera, model.projector, turn, model.shift])[free]
-    covariance = solved.covariance[np.ix_(free, free)]
+    covariance = scaled.covariance[np.ix_(free, free)]
+    hull = _hull(model, f, camera_used, projector_used)
     found = ScannerCalibration(
         id=hashlib.sha256(values.tobytes() + covariance.tobytes()).hexdigest()[:16],
         date=when.isoformat(timespec="seconds"),
@@ -474,13 +492,31 @@ def _result(
         ),
         coverage=(coverage[0], coverage[1]),
         board_sigma_mm=solved.board_sigma_mm,
-        jackknife_mm=jackknife,
+        jackknife_mm=jackknife if told else None,
         shape_u_mm=shape,
+        jackknife_ratio=ratio,
+        hull=hull,
+        weld=standard_weld(model.scanner(camera_size, projector_size), scaled.covariance, hull, where.points[13], axis),
         undetermined=tuple(name for name, _ in undetermined),
-        next_pose=_next(views, solved, where, linked, axis, undetermined, camera_size, projector_size),
+        next_pose=_next(views, scaled, where, linked, axis, undetermined, camera_size, projector_size),
         warnings=(),
     )
     return replace(found, warnings=tuple(_warnings(found, f, solved, undetermined)))
+
+
+def _hull(
+    model: bundle.BundleModel, f: bundle.Features, camera: NDArray[np.bool_], projector: NDArray[np.bool_]
+) -> CalibratedHull:
+    """Of the features that were used."""
+
+    def corners(pixels: Floats) -> Floats:
+        return np.asarray(cv2.convexHull(pixels.astype(np.float32))[:, 0], dtype=np.float64)
+
+    depths = np.einsum("nab,nb->na", model.turns[f.view], f.board_mm)[:, 2] + model.shifts[f.view][:, 2]
+    used = depths[camera]
+    return CalibratedHull(
+        corners(f.camera_px[camera]), corners(f.projector_px[projector]), (float(used.min()), float(used.max()))
+    )
 
 
 def _root_mean(squares: Floats) -> float:
@@ -516,13 +552,13 @@ def _coverage(pixels: Floats, size: tuple[int, int]) -> float:
 
 def _undetermined(
     model: bundle.BundleModel,
+    u: Floats,
     covariance: Floats,
     free: NDArray[np.intp],
     camera_size: tuple[int, int],
     projector_size: tuple[int, int],
 ) -> list[tuple[str, str]]:
-    """Parameters whose uncertainty is beyond use, each with the number that shows it."""
-    u = np.sqrt(np.diag(covariance))
+    """Parameters whose uncertainty u is beyond use, each with the number that shows it."""
     found: list[tuple[str, str]] = []
     for part, lens, size in ((0, model.camera, camera_size), (9, model.projector, projector_size)):
         device = "camera" if part == 0 else "projector"
@@ -620,7 +656,7 @@ def _warnings(
         lost = float((~solved.used[counted, column]).mean())
         if lost > REJECTED_SHARE:
             out.append(f"{lost:.0%} of the {name}'s features were rejected as outliers")
-    if found.board_sigma_mm is not None:
+    if found.board_sigma_mm is not None and max(found.board_sigma_mm) > FLAT_MM:
         inside, outside = found.board_sigma_mm
         out.append(
             f"the board departs from its drawing by {inside:.3f} mm in its plane and {outside:.3f} mm out of it (one "
@@ -634,14 +670,35 @@ def _warnings(
                     f"{pose.name}: {name} residuals of {pose.rms_px[column]:.2f} px rms, {typical[column]:.2f} px in "
                     "the others: was the board moved while it was captured?"
                 )
-    if found.jackknife_mm is not None and found.jackknife_mm > 3 * found.shape_u_mm and len(found.poses) > 3:
+    if found.jackknife_ratio is not None and found.jackknife_ratio > CONTRADICTION and len(found.poses) > 3:
         out.append(
             f"the poses agree with each other to {found.jackknife_mm:.3f} mm only, their noise explains "
-            f"{found.shape_u_mm:.3f} mm: "
+            f"{found.shape_u_mm:.3f} mm: every uncertainty was taken {found.jackknife_ratio:.1f} times as large; "
             + (
                 "is the board flat, and printed as stated?"
                 if found.board_sigma_mm is None
                 else "too few tilts, heat, or a projector whose response bends the phase?"
             )
+        )
+    out += _about_weld(found)
+    return out
+
+
+def _about_weld(found: ScannerCalibration) -> list[str]:
+    """Where the part will lie outside of where the boards were."""
+    weld, (near, far) = found.weld, found.hull.depth_mm
+    what = f"a pipe of 219 mm at {weld.distance_mm:.0f} mm"
+    if not math.isfinite(weld.u_mm):
+        return [f"{what}, the middle of the boards, is not in view of camera and projector"]
+    out = []
+    if weld.inside < LEAST_INSIDE:
+        out.append(
+            f"of the walls of {what} {weld.inside:.0%} lie where the boards were in both images, at least "
+            f"{LEAST_INSIDE:.0%} are needed for a PASS: let the board reach the images' borders in turn"
+        )
+    if weld.deep_enough < LEAST_INSIDE:
+        out.append(
+            f"of the walls of {what} {weld.deep_enough:.0%} lie between {near:.0f} and {far:.0f} mm from the camera, "
+            "where the boards were: add poses nearer and further"
         )
     return out

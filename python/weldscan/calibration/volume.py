@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from weldscan.calibration.bundle import (
     BundleModel,
     Features,
     Solution,
+    inverse_of,
     project,
     rows_of,
 )
@@ -83,26 +84,22 @@ def volume_of(model: BundleModel, f: Features, projector_size: tuple[int, int]) 
     near, far = (float(v) for v in np.quantile(depth, (0.02, 0.98)))
     low, high = np.quantile(f.camera_px, (0.01, 0.99), axis=0)
     middle, reach = (low + high) / 2, (high - low) / 2
-    out = []
-    for z in np.linspace(near, far, 3):
-        for v in (-1, 0, 1):
-            for u in (-1, 0, 1):
-                for share in np.linspace(1.0, 0.0, 41):
-                    pixel = middle + share * reach * np.array([u, v])
-                    point = _on_ray(model.camera, pixel, z)
-                    if share == 0 or _in_image(model, point[None], projector_size)[0]:
-                        out.append(point)
-                        break
-    return Volume(np.array(out))
+    places = np.array([[z, v, u] for z in np.linspace(near, far, 3) for v in (-1, 0, 1) for u in (-1, 0, 1)])
+    shares = np.linspace(1.0, 0.0, 41)
+    pixels = middle + shares[:, None, None] * reach * places[:, :0:-1]
+    points = _rays(model.camera, pixels.reshape(-1, 2)).reshape(*pixels.shape[:2], 3) * places[:, :1]
+    seen = _in_image(model, points.reshape(-1, 3), projector_size).reshape(len(shares), -1)
+    seen[-1] = True
+    return Volume(points[np.argmax(seen, axis=0), np.arange(len(places))])
 
 
-def _on_ray(lens: Floats, pixel: Floats, z: float) -> Floats:
-    """The point at a depth that a lens images at a pixel: Newton on the lens."""
-    point = np.array([(pixel[0] - lens[2]) / lens[0], (pixel[1] - lens[3]) / lens[1], 1.0])
+def _rays(lens: Floats, pixels: Floats) -> Floats:
+    """The points (n, 3) at unit depth that a lens images at pixels (n, 2): Newton on the lens."""
+    points = np.column_stack([(pixels - lens[2:4]) / lens[:2], np.ones(len(pixels))])
     for _ in range(20):
-        seen, _, by_point = project(lens, point[None])
-        point[:2] -= np.linalg.lstsq(by_point[0, :, :2], seen[0] - pixel, rcond=None)[0]
-    return np.asarray(point * z)
+        seen, _, by_point = project(lens, points)
+        points[:, :2] -= np.linalg.solve(by_point[..., :2], (seen - pixels)[..., None])[..., 0]
+    return np.asarray(points)
 
 
 def _in_image(model: BundleModel, points: Floats, size: tuple[int, int]) -> NDArray[np.bool_]:
@@ -119,10 +116,11 @@ def uncertainties(model: BundleModel, volume: Volume, covariance: Floats, axis: 
     scanner (the hand-eye) takes a common motion of all points up. What is left of it is the shape.
     """
     jacobian = point_jacobian(model, volume.points, axis).reshape(-1, 24)
-    whole = jacobian @ covariance @ jacobian.T
-    free = rigid_part(volume.points)
-    shape = free @ whole @ free
-    return tuple(np.sqrt(np.maximum(np.diag(c), 0)).reshape(-1, 3) for c in (whole, shape))  # type: ignore[return-value]
+    whole, shape = (
+        np.sqrt(np.maximum(((each @ covariance) * each).sum(axis=1), 0)).reshape(-1, 3)
+        for each in (jacobian, rigid_part(volume.points) @ jacobian)
+    )
+    return np.asarray(whole), np.asarray(shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,60 +157,65 @@ def best_pose(
         score: of a (24, 24) covariance.
     """
     model, free = solution.model, solution.free
-    best: Candidate | None = None
-    step = max(1, len(board_mm) // 40)
-    board = board_mm[::step]
+    # Some twenty of the features tell.
+    board = board_mm[:: max(1, len(board_mm) // 20)]
+    tried = [
+        (volume.points[place] * 0.5 + volume.points[13] * 0.5, tilt, around)
+        for place in (13, 4, 22, 9, 17, 11, 15)
+        for tilt in TILTS_DEG
+        for around in (AROUND_DEG if tilt else (0.0,))
+    ]
+    turns = np.array([_leaning(tilt, around) for _, tilt, around in tried])
+    shifts = np.array([target for target, _, _ in tried])
+    placed = np.einsum("cab,nb->cna", turns, board) + shifts[:, None]
+    ahead = (placed[..., 2] > 0).all(axis=1) & (((placed - model.shift) @ model.turn)[..., 2] > 0).all(axis=1)
+    turns, shifts, tried = turns[ahead], shifts[ahead], [each for each, ok in zip(tried, ahead, strict=True) if ok]
+    count, each = len(tried), len(board)
+    if not count:
+        return None
+    none = np.zeros((count * each, 2))
+    features = Features(
+        view=np.repeat(np.arange(count), each),
+        board_mm=np.tile(board, (count, 1)),
+        camera_px=none,
+        projector_px=none,
+        slope=np.zeros((len(none), 2, 2)),
+        relative_sigma=np.ones(len(none)),
+        number=np.tile(np.arange(each), count),
+    )
+    rows = rows_of(replace(model, turns=turns, shifts=shifts, shape=np.zeros_like(board)), features, shape=False)
+    if rows is None:
+        return None
+    # Nothing was "seen": the residuals are the projections themselves.
+    seen = _inside(rows.residuals[:, 0], camera_size) & _inside(rows.raw_projector, projector_size)
+    design = np.concatenate([rows.by_lenses, rows.by_pose], axis=3)
+    if slopes_known:
+        design[:, 1] -= _slope(rows.by_pose) @ design[:, 0]
     gain = len(board_mm) / len(board)
-    sigma = np.maximum(np.array(solution.sigma_px), 1e-6)
-    for place in (13, 4, 22, 9, 17, 11, 15):
-        target = volume.points[place] * 0.5 + volume.points[13] * 0.5
-        for tilt in TILTS_DEG:
-            for around in AROUND_DEG if tilt else (0.0,):
-                lean = math.radians(around)
-                turn = rotation_of(math.radians(tilt) * np.array([-math.sin(lean), math.cos(lean), 0.0]))
-                trial = BundleModel(
-                    model.camera,
-                    model.projector,
-                    model.turn,
-                    model.shift,
-                    turn[None],
-                    target[None],
-                    np.zeros_like(board),
-                )
-                features = Features(
-                    np.zeros(len(board), dtype=np.intp),
-                    board,
-                    np.zeros((len(board), 2)),
-                    np.zeros((len(board), 2)),
-                    np.zeros((len(board), 2, 2)),
-                    np.ones(len(board)),
-                    np.arange(len(board)),
-                )
-                rows = rows_of(trial, features)
-                if rows is None:
-                    continue
-                seen = _inside(rows.residuals[:, 0], camera_size) & _inside(rows.raw_projector, projector_size)
-                if seen.mean() < LEAST_IN_VIEW:
-                    continue
-                by_lenses, by_pose = rows.by_lenses[seen], rows.by_pose[seen]
-                if slopes_known:
-                    slope = _slope(by_pose)
-                    by_lenses[:, 1] -= slope @ by_lenses[:, 0]
-                    by_pose[:, 1] -= slope @ by_pose[:, 0]
-                scale = (math.sqrt(gain) / sigma)[None, :, None, None]
-                g, p = (by_lenses * scale).reshape(-1, 24), (by_pose * scale).reshape(-1, 6)
-                b, c = g.T @ p, p.T @ p
-                added = (g.T @ g - b @ np.linalg.solve(c, b.T))[np.ix_(free, free)]
-                information = solution.information[np.ix_(free, free)] + added
-                size = np.sqrt(np.diag(information))
-                covariance = np.zeros((24, 24))
-                covariance[np.ix_(free, free)] = np.linalg.inv(information / np.outer(size, size)) / np.outer(
-                    size, size
-                )
-                value = score(covariance)
-                if best is None or value < best.score:
-                    best = Candidate(rigid(turn, target), tilt, around, target, value)
+    design *= (math.sqrt(gain) / np.maximum(np.array(solution.sigma_px), 1e-6))[:, None, None] * seen[
+        :, None, None, None
+    ]
+    design = design.reshape(count, 4 * each, 30)
+    sums = np.swapaxes(design, 1, 2) @ design
+    best: Candidate | None = None
+    for k in np.flatnonzero(seen.reshape(count, each).mean(axis=1) >= LEAST_IN_VIEW):
+        # What the pose takes up says nothing of the lenses.
+        with_pose = sums[k, :24, 24:]
+        added = sums[k, :24, :24] - with_pose @ np.linalg.solve(sums[k, 24:, 24:], with_pose.T)
+        information = (solution.information + added)[np.ix_(free, free)]
+        covariance = np.zeros((24, 24))
+        covariance[np.ix_(free, free)] = inverse_of(information)
+        value = score(covariance)
+        if best is None or value < best.score:
+            _, tilt, around = tried[k]
+            best = Candidate(rigid(turns[k], shifts[k]), tilt, around, shifts[k], value)
     return best
+
+
+def _leaning(tilt_deg: float, around_deg: float) -> Floats:
+    """How a board stands whose normal leans by a tilt, to the image's right at 0, down at 90."""
+    lean = math.radians(around_deg)
+    return rotation_of(math.radians(tilt_deg) * np.array([-math.sin(lean), math.cos(lean), 0.0]))
 
 
 def _inside(pixels: Floats, size: tuple[int, int]) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 from weldscan.errors import InputError, NotMeasured
 from weldscan.pose import KukaPose
-from weldscan.records.files import write_file
+from weldscan.records.files import write_files
 from weldscan.simulated import DEFAULT, Cell, session_document
 from weldscan.simulated.controllers import Arm
 from weldscan.simulated.controllers.kvp import KvpController
@@ -35,6 +35,7 @@ host = "127.0.0.1"         # the controller
 port = 7000
 allow_motion = true        # here nothing can be hit. In a real cell false, until motion is wanted, in T1
 largest_move_mm = 1000.0   # a target further away is refused
+largest_turn_deg = 180.0   # and one that is turned by more
 
 [camera]
 backend = "simulated"      # or "opencv", "aravis", "pylon", "folder"
@@ -72,14 +73,16 @@ def record_live(
     plan = session_document(cell)
     arm = Arm(KukaPose(*plan["shots"][0]["flange_pose"].values()))
     arm.speed_mm_s, arm.turn_speed_deg_s = SPEED_MM_S, TURN_SPEED_DEG_S
-    with KvpController(arm) as controller, TemporaryDirectory() as scratch:
+    # Beside the session, so that what a killed demo leaves is in its own folder.
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with KvpController(arm) as controller, TemporaryDirectory(prefix=".plan-", dir=folder.parent) as scratch:
         path = Path(scratch) / "plan.json"
         path.write_text(json.dumps(plan), encoding="utf-8")
         link = {"link": "kvp", "port": controller.port}
         projector = cell.scanner.projector
         config = CellConfig(
             name=cell.name,
-            robot=link | {"allow_motion": True, "largest_move_mm": 10_000.0},
+            robot=link | {"allow_motion": True, "largest_move_mm": 10_000.0, "largest_turn_deg": 180.0},
             camera={"backend": "simulated", "controller": link, "cell": cell},
             projector={"backend": "simulated", "width": projector.width, "height": projector.height},
             scan={"plan": str(path), "still_window_s": 0.05},
@@ -113,6 +116,5 @@ def write_example(folder: Path, cell: Cell = DEFAULT) -> str:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror or error}") from None
-    for file, content in files.items():
-        write_file(file, content)
+    write_files(files)
     return "\n".join(line.removeprefix("# ") for line in text.splitlines()[:7])

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import Lens, Scanner, whitened
+from weldscan._weldcore import Scanner, whitened
 from weldscan.calibration.bundle import K3, PARAMETERS, BundleModel, Features, prior_sigmas, rows_of
 from weldscan.calibration.volume import point_jacobian
 from weldscan.geometry import rotation_of
@@ -172,20 +172,6 @@ def _propagated(gain: Floats, covariance: Floats) -> Floats:
     return np.asarray(np.sqrt(np.maximum(np.einsum("ai,ij,aj->a", gain, covariance, gain), 0.0)))
 
 
-def model_of(scanner: Scanner, turns: Floats, shifts: Floats) -> BundleModel:
-    """A scanner's numbers as the bundle adjustment has them, with the poses of a board."""
-
-    def numbers(lens: Lens) -> Floats:
-        k, dist = lens.K, [*lens.dist, 0.0][:5]
-        return np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], *dist])
-
-    relation = scanner.camera_from_projector
-    shape = np.zeros((CORNERS[0] * CORNERS[1], 3))
-    return BundleModel(
-        numbers(scanner.camera), numbers(scanner.projector), relation[:3, :3], relation[:3, 3], turns, shifts, shape
-    )
-
-
 def stated_covariance(spec: ScannerSpec) -> Floats | None:
     """The scanner file's covariance in the order of PARAMETERS, (24, 24); None where it states none of all of them.
 
@@ -254,7 +240,7 @@ def nominal_covariance(scanner: Scanner, distance_mm: float) -> Floats:
     turns = np.array([rotation_of(np.radians([*tilt, 0.0])) for _, tilt in tilts])
     # Nearer boards are moved along the ray to the field's middle.
     shifts = np.array([near * np.array([*middle, distance_mm]) for near, _ in tilts])
-    model, count = model_of(scanner, turns, shifts), len(corners)
+    model, count = BundleModel.of(scanner, turns, shifts, len(corners)), len(corners)
     none = np.zeros((len(tilts) * count, 2))
     features = Features(
         view=np.repeat(np.arange(len(tilts)), count),
@@ -267,7 +253,7 @@ def nominal_covariance(scanner: Scanner, distance_mm: float) -> Floats:
     )
     size_c, size_p = ((lens.width, lens.height) for lens in (scanner.camera, scanner.projector))
     information = np.diag(prior_sigmas(model, size_c, size_p) ** -2.0)
-    rows = rows_of(model, features)
+    rows = rows_of(model, features, shape=False)
     if rows is not None:
         # Nothing was "seen": the residuals are the projections themselves.
         pixels = rows.residuals
@@ -327,7 +313,7 @@ def step_jacobians(
         Two of (n, 24), mm per unit of each parameter: without and with the walls' shrinkage in the model; none where no
         view shows both walls.
     """
-    model = model_of(scanner, np.empty((0, 3, 3)), np.empty((0, 3)))
+    model = BundleModel.of(scanner)
     rows, moves = [], []
     for view in views:
         shot = view.shot

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from weldscan._weldcore import WeldShot, WeldStep, __version__, measure_step, place_shots, segment_weld
 from weldscan.calibration.hand_eye import point_uncertainty_mm, pose_sigma
 from weldscan.errors import GeometryError, InputError
+from weldscan.measure.calibrated_part import about_region, held_against_calibration, mostly_outside
 from weldscan.measure.calibration_margin import CalibrationMargin, Unevenness, calibration_above, calibration_margin
 from weldscan.measure.journal import Journal, SetPhaseError, ShotReading, took
 from weldscan.measure.observable_terms import seam_terms
@@ -209,7 +210,12 @@ class _Run:
         if segmented is not None:
             refused = other_part(scan.points_mm, part, axis, segmented)
         if segmented is None or refused is not None:
-            return None, noticed + Journal(left_out=((shot.name, str(refused)),))
+            why = f"{refused}{mostly_outside(scan.points_mm, scan.outside_mm)}"
+            return None, noticed + Journal(left_out=((shot.name, why),))
+        said = held_against_calibration(
+            shot.name, self.session.scanner, segmented, scan.points_mm, scan.outside_mm, part.wall_thickness
+        )
+        noticed += Journal(said)
         view = PartView(
             shot.name,
             self.session.part_shots.index(shot),
@@ -218,6 +224,7 @@ class _Run:
             base_from_flange(shot) if self.session.has_robot else np.eye(4),
             base_from_scanner,
             segmented,
+            None if self.session.scanner.hull is None else self.session.scanner.hull.build(),
         )
         return view, noticed
 
@@ -411,9 +418,9 @@ class _Run:
     def scanner_record(self) -> tuple[ScannerRecord | None, tuple[Finding, ...]]:
         """Which calibration of the scanner this is, where the session says; with a warning where it is out of date."""
         spec = self.session.scanner
+        said = [] if (unknown := about_region(spec)) is None else [unknown]
         if spec.id is None:
-            return None, ()
-        said = []
+            return None, tuple(said)
         expired = spec.valid_until is not None and date.fromisoformat(spec.valid_until) < datetime.now(UTC).date()
         if expired:
             text = (

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldscan._weldcore import SeamFrame, WeldShot
+from weldscan.result import CalibratedHull
 
 Floats = NDArray[np.float64]
 
@@ -28,6 +29,8 @@ class PartView:
     base_from_scanner: Floats
     """(4, 4); the identity without a robot."""
     shot: WeldShot
+    hull: CalibratedHull | None = None
+    """Where the scanner is calibrated: what lies outside was masked; None: not known."""
 
     @property
     def seam_in_base(self) -> SeamFrame:

@@ -33,10 +33,14 @@ SATURATED_PART, LOST_PART = 0.50, 0.75
 WAVES_MM = 0.12
 # Stations of two shots read the same place where they share so much of it, in stations.
 SAME_PLACE = 0.6
+# If the surfaces beside its toes are off by this part of what a station reads off its neighbours, so are the walls.
+LOCAL_PART = 0.5
 # So many stations without a reading are a gap: one may be a drop of spatter or a small hole.
 GAP_STATIONS = 1.75
 # Three sigma of what is stated with k = 2.
 CONTRADICTION = 1.5
+# Nothing is measured where fewer of the pixels at the weld have a point: some of its neighbours' noise.
+DARK_PART = 0.05
 # A bin with points that lies so near a station that was read: a hole at the toe is no gap of the seam.
 REACH_STATIONS = 1.25
 # A bin with fewer pixels is the sliver of a view.
@@ -131,7 +135,8 @@ class _EdgesOfShot:
     def of(cls, view: PartView) -> Self:
         """From a view's sections."""
         shot, sections = view.shot, view.shot.sections
-        read, expanded = _shared(sections["edge_step_mm"], 2 * sections["edge_standard_mm"] + sections["edge_hull_mm"])
+        expanded = 2 * sections["edge_standard_mm"] + sections["edge_hull_mm"]
+        read, expanded = _shared(sections["edge_step_mm"], expanded, sections["local_step_mm"])
         lower = np.abs(read) - expanded
         # The same sign: two that stand off in opposite directions confirm nothing.
         pairs = np.where(np.sign(read[1:]) == np.sign(read[:-1]), np.fmin(lower[1:], lower[:-1]), np.nan)
@@ -165,19 +170,20 @@ def _read_of_bin(shots: Sequence[_EdgesOfShot], k: int) -> list[tuple[Floats, Fl
     return found
 
 
-def _shared(read: Floats, expanded: Floats) -> tuple[Floats, Floats]:
-    """The readings of one shot's stations; where one is beyond both its neighbours, the worse of these.
-
-    It is a drop of spatter, or a ripple taken for the toe: what begins and ends within 4 mm is no misalignment.
+def _shared(read: Floats, expanded: Floats, local: Floats) -> tuple[Floats, Floats]:
+    """The readings of one shot's stations; where one is beyond both its neighbours, the worse of these: it is a drop of
+    spatter, or a ripple taken for the toe. Not where the surfaces beside the weld are off as well: `local` is how far.
     """
     upper = np.abs(read) + expanded
-    read, expanded = read.copy(), expanded.copy()
+    shared, uncertain = read.copy(), expanded.copy()
     for k in range(1, len(read) - 1):
         worse = k - 1 if upper[k - 1] > upper[k + 1] else k + 1
         # Nothing is beyond an unknown one.
         if upper[k] > upper[worse] and upper[k] > upper[2 * k - worse]:
-            read[k], expanded[k] = read[worse], expanded[worse]
-    return read, expanded
+            off = read[k] - read[worse]
+            if not local[k] * off > LOCAL_PART * off**2:
+                shared[k], uncertain[k] = read[worse], expanded[worse]
+    return shared, uncertain
 
 
 def _stations_by_bin(view: PartView) -> dict[int, NDArray[np.intp]]:
@@ -225,6 +231,8 @@ def _field(view: PartView, scanner: Scanner) -> tuple[NDArray[np.bool_], Floats]
             ):
                 size = np.array([lens.width, lens.height]) - 1 - BORDER_PX
                 inside &= ((pixels >= BORDER_PX) & (pixels <= size)).all(axis=1)
+            if view.hull is not None:
+                inside &= view.hull.holds(scanner.camera.project(points), scanner.project_to_projector(points))
             for eye in (np.zeros(3), np.asarray(scanner.camera_from_projector)[:3, 3]):
                 ray = eye - points
                 cosine = np.einsum("ij,ij->i", ray, normal) / np.linalg.norm(ray, axis=1)
@@ -357,10 +365,11 @@ def seam_of(
     measured, course = set(measured), views[0].shot.seam.course
     tables = [seam_fates(view.shot, np.ascontiguousarray(view.reason), scanner) for view in views]
     every: NDArray[np.int64] = np.zeros((course.bins, len(FATES)), np.int64)
-    for table, _ in tables:
+    for table, _, _ in tables:
         every += table
+    at_weld = [near for _, near, _ in tables]
     expected = expected_bins(views, scanner)
-    beside = _beside_read(views, [near for _, near in tables]) & expected
+    beside = _beside_read(views, at_weld) & expected
     coverage = coverage_of(course, measured | beside, expected, required, required_by)
     whole = course.turn is not None and coverage.required_deg >= course.turn
     wanted = set(range(course.bins)) if whole else expected
@@ -380,11 +389,13 @@ def seam_of(
         for k in range(course.bins)
         if k in wanted or k in measured or every[k][POINTS].sum() >= LEAST_PIXELS
     )
-    findings = [*_of_coverage(course, coverage), *_of_gaps(views, expected & (measured | beside))]
-    for view, (table, near) in zip(views, tables, strict=True):
+    counted = expected & (measured | beside)
+    findings = [*_of_coverage(course, coverage)]
+    findings += _of_gaps(views, counted) or _of_dark(views, [cells for _, _, cells in tables], counted)
+    for view, (table, near, _) in zip(views, tables, strict=True):
         findings += _of_fates(view, table, near, measured | expected)
         findings += [bar(code, text, view.name, along) for code, along, text in view.shot.doubts]
-    findings += _of_lost(views, [near for _, near in tables], measured | expected, expected)
+    findings += _of_lost(views, at_weld, measured | expected, expected)
     return Seam(bins, coverage, tuple(findings))
 
 
@@ -451,6 +462,28 @@ def _of_gaps(views: Sequence[PartView], counted: set[int]) -> list[Finding]:
         return []
     text = f"over {longest[0]:.0f} mm of the seam the weld was not read, between places where it was"
     return [bar("coverage", text, None, longest[1])]
+
+
+def _of_dark(views: Sequence[PartView], cells: Sequence[NDArray[np.uint32]], counted: set[int]) -> list[Finding]:
+    """A bar where no view has points at the weld over a station's length, in bins that count as seen: a station takes
+    what lies in half of it for the whole.
+    """
+    course = views[0].shot.seam.course
+    per_bin = max(table.shape[1] for table in cells)
+    lit = np.zeros((course.bins, per_bin))
+    for table in cells:
+        # Courses that differ in radius may have another number of cells.
+        own = ((np.arange(per_bin) + 0.5) * table.shape[1] / per_bin).astype(int)
+        lit = np.maximum(lit, (table[:, :, 1] / np.maximum(table[:, :, 0], 1))[:, own])
+    dark = (np.isin(np.arange(course.bins), list(counted))[:, None] & (lit < DARK_PART)).ravel()
+    cell_mm = course.along_mm(course.at(course.bin_width)) / per_bin
+    run = max(2, round(min(view.shot.station_mm for view in views) / cell_mm))
+    starts = np.all([np.roll(dark, -off) for off in range(run)], axis=0)
+    if not starts.any():
+        return []
+    at = course.told(course.bin_width * ((float(np.argmax(starts)) + run / 2) / per_bin - 0.5))
+    text = f"over {cell_mm * run:.0f} mm of the seam and more no point was measured at the weld"
+    return [bar("coverage", text, None, at)]
 
 
 def _of_fates(view: PartView, whole: NDArray[np.uint32], near: NDArray[np.uint32], judged: set[int]) -> list[Finding]:

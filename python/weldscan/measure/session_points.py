@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import PhaseMap, Scanner, decode, triangulate
+from weldscan._weldcore import Cloud, PhaseMap, Scanner, decode, outside_calibration, triangulate
 from weldscan.errors import InputError
 from weldscan.measure.journal import Journal, SetPhaseError, ShotReading, took
 from weldscan.records.frames import read_frames
@@ -27,7 +27,8 @@ Compensate = Literal["auto", "off"] | PhaseErrorOf
 
 # A harmonic of a tenth of the fringes' own amplitude shifts a four-step phase by 0.01 rad or more: worth a word.
 HARMONIC_WARNING = 0.1
-MASKS = ("ok", "dark", "saturated", "order_in_doubt", "no_fit")
+MASKS = ("ok", "dark", "saturated", "order_in_doubt", "no_fit", "outside_calibration")
+OUTSIDE_CALIBRATION = MASKS.index("outside_calibration")
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +40,12 @@ class Scan:
     sigma_mm: NDArray[np.float32] | None
     """(H, W): noise of each point along its ray, one sigma."""
     reason: NDArray[np.uint8]
-    """(H, W): why a pixel has no point, as `PhaseMap.reason` says it."""
+    """(H, W): why a pixel has no point, as `PhaseMap.reason` says it, or OUTSIDE_CALIBRATION."""
     reading: ShotReading
     noticed: Journal
     """Of it, its reading among the rest."""
+    outside_mm: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    """(n, 3), scanner frame: points that are masked because the scanner is not calibrated there."""
 
 
 class PointReader:
@@ -86,10 +89,26 @@ class PointReader:
             raise InputError(f"{self.session.folder / 'session.json'}: fringes: {error}") from None
         noticed, t = noticed + took("decode", t), time.perf_counter()
         cloud = triangulate(phase.column_px, self.scanner, phase.sigma_px, self.axis)
+        reason, outside = self._masked(cloud, phase)
         noticed += took("triangulate", t)
-        reading = self._reading(shot, phase, digest(exposures))
+        reading = self._reading(shot, phase, digest(exposures), len(outside))
         noticed += Journal(tuple(self._findings(shot, phase)), shots=(reading,))
-        return Scan(cloud.points_mm, cloud.sigma_mm, phase.reason, reading, noticed)
+        return Scan(cloud.points_mm, cloud.sigma_mm, reason, reading, noticed, outside)
+
+    def _masked(self, cloud: Cloud, phase: PhaseMap) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        """The reasons, and the points that lie outside the hull of the scanner's calibration: they are taken out of the
+        cloud.
+        """
+        hull = self.session.scanner.hull
+        if hull is None:
+            return phase.reason, np.zeros((0, 3))
+        corners = np.array(hull.camera_px), np.array(hull.projector_px)
+        outside = outside_calibration(cloud.points_mm, self.scanner, *corners)
+        points = cloud.points_mm[outside]
+        cloud.points_mm[outside] = np.nan
+        if cloud.sigma_mm is not None:
+            cloud.sigma_mm[outside] = np.nan
+        return np.where(outside, np.uint8(OUTSIDE_CALIBRATION), phase.reason), points
 
     def _findings(self, shot: ShotSpec, phase: PhaseMap) -> Iterator[Finding]:
         for each in phase.disagreements:
@@ -106,10 +125,11 @@ class PointReader:
                 shot.name,
             )
 
-    def _reading(self, shot: ShotSpec, phase: PhaseMap, digest: str) -> ShotReading:
+    def _reading(self, shot: ShotSpec, phase: PhaseMap, digest: str, outside: int) -> ShotReading:
+        ok, *others = map(int, phase.counts)
         return ShotReading(
             shot.name,
-            dict(zip(MASKS, map(int, phase.counts), strict=True)),
+            dict(zip(MASKS, (ok - outside, *others, outside), strict=True)),
             digest,
             tuple(
                 SetPhaseError(

@@ -3,7 +3,7 @@
 | document                        | module         |
 |---------------------------------|----------------|
 | weldscan-session/1, and a plan  | `session`, `part`, `frames`, `plan` |
-| weldscan-scanner/1              | `scanner`      |
+| weldscan-scanner/2              | `scanner`      |
 | weldscan-hand-eye/1             | `hand_eye`     |
 | weldscan-shot/1                 | `shot`         |
 | weldscan-calibration/1          | `capture`      |

@@ -84,6 +84,18 @@ def _day(text: str) -> str:
         raise ValueError(f"{text!r} is not a day as YYYY-MM-DD") from None
 
 
+def _convex(corners: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    """The corners of a convex polygon, in either direction."""
+    array = np.asarray(corners)
+    sides = np.roll(array, -1, axis=0) - array
+    after = np.roll(sides, -1, axis=0)
+    turns = sides[:, 0] * after[:, 1] - sides[:, 1] * after[:, 0]
+    around = float(np.arctan2(turns, (sides * after).sum(axis=1)).sum())
+    if not ((turns >= 0).all() or (turns <= 0).all()) or abs(abs(around) - 2 * math.pi) > PARALLEL_SINE:
+        raise ValueError("should be the corners of a convex polygon, in order")
+    return corners
+
+
 def plain_name(name: str) -> str:
     """A name that is also a folder's: it can neither leave the session's folder nor hide in it."""
     if not re.fullmatch(r"[^\W_][\w .+-]{0,99}", name) or name[-1] in ". ":
@@ -104,6 +116,7 @@ def check_covariance(matrix: Matrix, size: int = 6) -> Matrix:
 
 Rigid = Annotated[Matrix, AfterValidator(_rigid)]
 CameraMatrix = Annotated[Matrix, AfterValidator(_camera_matrix)]
+Polygon = Annotated[tuple[tuple[Real, Real], ...], Field(min_length=3, max_length=1000), AfterValidator(_convex)]
 PlainName = Annotated[str, AfterValidator(plain_name)]
 Direction = Annotated[Vector, AfterValidator(_non_zero)]
 Day = Annotated[str, AfterValidator(_day)]

@@ -20,16 +20,23 @@ import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, NoReturn, Self
 
 import numpy as np
 
-from weldscan.errors import InputError
+from weldscan.errors import InputError, Unreadable
+
+try:
+    import fcntl
+except ImportError:  # Windows: what killed processes left is then not tidied up
+    fcntl = None  # type: ignore[assignment]
 
 MAX_TEXT_BYTES = 16 * 1024 * 1024
 MAX_TOML_BYTES = 256 * 1024
 MAX_DEPTH = 64
 """Of lists and objects within each other; the deepest document has 7."""
+IS_NO_FILE = (errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENXIO)
+"""Errors that say of a path what it is; all others, but that there is none, say nothing about what a file holds."""
 # A name of so many parts is as deep a document. `tomllib` would take minutes for some 10,000 dots.
 DEEP_NAME = re.compile(rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{MAX_DEPTH}}}""")
 
@@ -46,7 +53,8 @@ def read_bytes(path: Path, most: int = MAX_TEXT_BYTES, what: str = "file") -> by
         what: it is, for the message where there is none.
 
     Raises:
-        InputError: there is none, it is a pipe, a device or a folder, it is larger, or it cannot be read.
+        InputError: there is none, it is a pipe, a device or a folder, or it is larger.
+        Unreadable: the system does not give it.
     """
     try:
         # Without O_NONBLOCK the opening of a pipe would wait for somebody to write into it.
@@ -55,7 +63,7 @@ def read_bytes(path: Path, most: int = MAX_TEXT_BYTES, what: str = "file") -> by
     except FileNotFoundError:
         raise InputError(f"{path}: no such {what}") from None
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read: {_reason(error)}") from None
+        raise unread(path, error) from None
     try:
         found = os.fstat(descriptor)
         if stat.S_ISDIR(found.st_mode):
@@ -68,12 +76,28 @@ def read_bytes(path: Path, most: int = MAX_TEXT_BYTES, what: str = "file") -> by
         while found.st_size <= most and len(data) <= most and (part := os.read(descriptor, chunk)):
             data += part
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {_reason(error)}") from None
+        raise unread(path, error) from None
     finally:
         os.close(descriptor)
     if max(found.st_size, len(data)) > most:
         raise InputError(f"{path}: is larger than {f'{most >> 20} MB' if most >> 20 else f'{most >> 10} kB'}")
     return data
+
+
+def unread(path: Path, error: OSError | ValueError) -> InputError:
+    """What to raise for a file that could not be read: `Unreadable`, unless the error says what is wrong with it."""
+    known = isinstance(error, ValueError) or error.errno in IS_NO_FILE
+    return (InputError if known else Unreadable)(f"{path}: cannot be read: {_reason(error)}")
+
+
+def listed(folder: Path) -> list[Path]:
+    """What a folder holds, by name; nothing where there is none. Raises `Unreadable`."""
+    try:
+        return sorted(folder.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as error:
+        raise unread(folder, error) from None
 
 
 def read_text(path: Path, most: int = MAX_TEXT_BYTES, what: str = "file") -> str:
@@ -190,7 +214,24 @@ def _reason(error: OSError | ValueError) -> str:
 
 # --- out --------------------------------------------------------------------------------------------------------------
 
+CANNOT_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF)
+"""What systems say that do not sync folders."""
 CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
+
+
+def check_file(path: Path) -> None:
+    """Says early that a file cannot be written, before anything is measured for it."""
+    if path.is_dir():
+        raise InputError(f"{path}: cannot be written: {os.strerror(errno.EISDIR)}")
+    _check_folder(path, path.absolute().parent)
+
+
+def _check_folder(path: Path, folder: Path | None) -> None:
+    """Says that what is to go into a folder cannot be written there."""
+    if folder is None or not folder.is_dir():
+        raise InputError(f"{path}: cannot be written: {folder} is not a folder")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"{path}: cannot be written: {folder} is not a folder that may be written to")
 
 
 def write_file(path: Path, content: str | bytes) -> None:
@@ -199,16 +240,36 @@ def write_file(path: Path, content: str | bytes) -> None:
     Raises:
         InputError: it cannot be written; what was there is untouched.
     """
-    partial = _sibling(path, "partial")
+    write_files({path: content})
+
+
+def write_files(contents: Mapping[Path, str | bytes]) -> None:
+    """As `write_file`, for files that belong together: none gets its name before the disk has all of them."""
+    partials = {path: _sibling(path, "partial") for path in contents}
+    path = next(iter(partials))
     try:
-        write_synced(partial, content)
-        partial.replace(path)
-        sync_folder(path.parent)
+        for path, partial in partials.items():
+            remove_unfinished(path.parent, path.name)
+            write_synced(partial, contents[path])
+        for path, partial in partials.items():
+            while not _replaced(partial, path):  # it was taken for a dead one's
+                write_synced(partial, contents[path])
+            sync_folder(path.parent)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {_reason(error)}") from None
     finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
+        for partial in partials.values():
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
+
+
+def _replaced(partial: Path, path: Path) -> bool:
+    """Gives a finished file its name, if it is still there."""
+    with _Claim(partial):
+        if not partial.exists():
+            return False
+        partial.replace(path)
+        return True
 
 
 class whole_folder:
@@ -232,10 +293,15 @@ class whole_folder:
         self.check(self.path, self.replaces)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self.partial.mkdir()
+            remove_unfinished(self.path.parent, self.path.name)
+            while True:
+                self.partial.mkdir()
+                self._claim = _Claim(self.partial)
+                if self.partial.exists():  # nobody took it for a dead one's before it was claimed
+                    return self.partial
+                self._claim.release()
         except OSError as error:
             raise InputError(f"{self.path}: cannot be written: {_reason(error)}") from None
-        return self.partial
 
     @staticmethod
     def check(path: Path, replaces: Callable[[Path], bool] = lambda _: False) -> None:
@@ -244,14 +310,12 @@ class whole_folder:
             raise InputError(f"{path}: exists and is not a folder")
         if path.is_dir() and any(path.iterdir()) and not replaces(path):
             raise InputError(f"{path}: exists and holds something else; name another folder or remove it")
-        above = next((parent for parent in path.absolute().parents if parent.exists()), None)
-        if above is None or not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-            raise InputError(f"{path}: cannot be written: {above} is not a folder that may be written to")
+        _check_folder(path, next((parent for parent in path.absolute().parents if parent.exists()), None))
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         try:
             if kind is None:
-                for folder, _, _ in os.walk(self.partial):
+                for folder, _, _ in os.walk(self.partial, onerror=_raise):
                     sync_folder(Path(folder))
                 self._swap()
                 sync_folder(self.path.parent)
@@ -259,6 +323,7 @@ class whole_folder:
             raise InputError(f"{self.path}: cannot be written: {_reason(failure)}") from None
         finally:
             shutil.rmtree(self.partial, ignore_errors=True)
+            self._claim.release()
         if isinstance(error, OSError) and error.errno in CANNOT_WRITE:
             raise InputError(f"{self.path}: cannot be written: {_reason(error)}") from error
         if isinstance(error, InputError) and str(self.partial) in str(error):
@@ -268,17 +333,17 @@ class whole_folder:
     def _swap(self) -> None:
         """Moves the old folder aside, the new one in, and only then removes the old."""
         self.check(self.path, self.replaces)
-        old = None
-        if self.path.is_dir():
-            old = self.path.rename(_sibling(self.path, "old"))
-        try:
+        if not self.path.is_dir():
             self.partial.rename(self.path)
-        except OSError:
-            if old is not None:
+            return
+        with _Claim(self.path):
+            old = self.path.rename(_sibling(self.path, "old"))
+            try:
+                self.partial.rename(self.path)
+            except OSError:
                 old.rename(self.path)
-            raise
-        finally:
-            if old is not None:
+                raise
+            finally:
                 shutil.rmtree(old, ignore_errors=True)
 
 
@@ -295,10 +360,13 @@ def sync_folder(folder: Path) -> None:
     """Waits until the disk has a folder's entries; systems that cannot sync folders do without."""
     try:
         descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
+    except PermissionError:
         return
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in CANNOT_SYNC:
+            raise
     finally:
         os.close(descriptor)
 
@@ -311,17 +379,110 @@ def is_earlier(folder: Path, files: Iterable[str], document: str, schema: str) -
         files: that such a result has, or had.
         document: the one of them that says what it is.
         schema: with which that says it, or how it begins.
+
+    Raises:
+        Unreadable: the document is there, but nobody knows what it says.
     """
     if not {entry.name for entry in folder.iterdir()} <= set(files):
         return False
     try:
         return str(read_json(folder / document)["schema"]).startswith(schema)
+    except Unreadable:
+        raise
     except (InputError, KeyError, TypeError):
         return False
 
 
 def _sibling(path: Path, suffix: str) -> Path:
     return path.parent / f".{path.name}.{secrets.token_hex(4)}.{suffix}"
+
+
+UNFINISHED = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{8}\.(?P<what>partial|old)")
+"""The names of what is being written, or replaced."""
+
+
+def is_unfinished(name: str) -> bool:
+    """Whether a file or folder of this name is one that is being written, or was when its process died."""
+    return UNFINISHED.fullmatch(name) is not None
+
+
+def remove_unfinished(folder: Path, name: str | None = None) -> None:
+    """Tidies up after processes that were killed while they wrote here; what living ones write is left alone.
+
+    Args:
+        folder: where.
+        name: of the file or folder that was being written; by default any.
+
+    Raises:
+        OSError: the folder cannot be listed.
+    """
+    for entry in folder.iterdir():
+        found = UNFINISHED.fullmatch(entry.name)
+        if found is None or name not in (None, found["name"]) or entry.is_symlink():
+            continue
+        with _Claim(entry, wait=False) as claim:
+            if not claim.held:
+                continue
+            if found["what"] == "old" and not os.path.lexists(folder / found["name"]):
+                entry.rename(folder / found["name"])  # it was being replaced, and is not
+            elif entry.is_dir():
+                shutil.rmtree(entry, ignore_errors=True)
+            else:
+                entry.unlink(missing_ok=True)
+
+
+class _Claim:
+    """Holds a file or folder that is being written, so that others see that its process lives.
+
+    Args:
+        path: of the file or folder.
+        wait: until it is free; otherwise `held` says whether it was.
+    """
+
+    def __init__(self, path: Path, wait: bool = True) -> None:
+        self.held, self._descriptor = False, -1
+        if fcntl is None:
+            return
+        with contextlib.suppress(OSError):  # it is gone, or this file system knows no locks: then nobody removes it
+            self._descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            self.held = True
+
+    def release(self) -> None:
+        """Let others have it."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+        self.held, self._descriptor = False, -1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+
+def own_file(path: Path) -> BinaryIO:
+    """Opens a file of a fixed name to append to, and makes it if need be; never through a link that somebody laid.
+
+    Raises:
+        InputError: a link, a folder, a pipe or a device is in its place.
+        OSError: it cannot be opened.
+    """
+    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    try:
+        descriptor = os.open(path, flags, 0o666)
+    except OSError as error:
+        if error.errno in IS_NO_FILE:
+            raise InputError(f"{path}: is no regular file") from None
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise InputError(f"{path}: is no regular file")
+    return os.fdopen(descriptor, "ab")
+
+
+def _raise(error: OSError) -> NoReturn:
+    raise error
 
 
 def to_json(document: Any) -> str:

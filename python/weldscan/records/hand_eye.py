@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from weldscan.errors import InputError
+from weldscan.errors import InputError, Unreadable
 from weldscan.records.fields import Matrix, Model, Rigid, Vector, check_covariance, read_model
 from weldscan.records.files import inside, plain, to_json, write_file
 from weldscan.result import HandEye
@@ -96,6 +96,8 @@ def write_hand_eye(path: str | os.PathLike[str], hand_eye: HandEye) -> HandEyeSp
     if path.exists():
         try:
             read_hand_eye(path)
+        except Unreadable:
+            raise
         except InputError as error:
             raise InputError(
                 f"{path}: exists and is no hand-eye calibration: remove it or name another ({error})"

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from weldscan.errors import InputError
+from weldscan.errors import InputError, Unreadable
 from weldscan.records.fields import read_model
-from weldscan.records.files import read_json, to_json, write_file
+from weldscan.records.files import check_file, read_json, to_json, write_file
 from weldscan.records.hand_eye import HandEyeSpec
 from weldscan.records.scanner import ScannerSpec, with_scanner
 from weldscan.records.session import ArtefactSpec, FringeSet, RobotSpec, Session, ShotSpec, parse_session
@@ -67,12 +67,13 @@ def read_source(path: str | os.PathLike[str]) -> PlanSource:
 
 def check_plan(path: Path) -> None:
     """Says early what would be in the way of a plan: only an earlier plan for a hand-eye calibration is replaced."""
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path}: cannot be written: {path.absolute().parent} is not a folder")
+    check_file(path)
     if not path.exists():
         return
     try:
         ours = str(read_json(path)["name"]).endswith(NAME)
+    except Unreadable:
+        raise
     except (InputError, KeyError, TypeError):
         ours = False
     # A session's own document has its images beside it.

@@ -1,4 +1,4 @@
-"""A calibrated scanner, `weldscan-scanner/1`, as `weldscan calibrate scanner` writes it and every session has it."""
+"""A calibrated scanner, `weldscan-scanner/2`, as `weldscan calibrate scanner` writes it and every session has it."""
 
 from __future__ import annotations
 
@@ -7,25 +7,28 @@ import os
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from weldscan._weldcore import Lens, Scanner
-from weldscan.errors import InputError
+from weldscan.errors import InputError, Unreadable
 from weldscan.records.fields import (
     CameraMatrix,
     Day,
     Matrix,
     Model,
     Pixels,
+    Polygon,
+    Positive,
     Real,
     Rigid,
     check_covariance,
     read_model,
 )
 from weldscan.records.files import inside, plain, to_json, write_file
-from weldscan.result import ScannerCalibration
+from weldscan.result import CalibratedHull, ScannerCalibration
 
-SCHEMA = "weldscan-scanner/1"
+SCHEMA = "weldscan-scanner/2"
 
 
 class LensSpec(Model):
@@ -49,17 +52,30 @@ class CovarianceSpec(Model):
         return self
 
 
+class HullSpec(Model):
+    """Where a scanner is calibrated: convex polygons in both images, and the depths between which the boards stood."""
+
+    camera_px: Polygon
+    projector_px: Polygon
+    depth_mm: tuple[Positive, Positive]
+
+    def build(self) -> CalibratedHull:
+        """As arrays."""
+        return CalibratedHull(np.array(self.camera_px), np.array(self.projector_px), self.depth_mm)
+
+
 class ScannerSpec(Model):
     """A calibrated camera-projector pair; the scanner's frame is the camera's.
 
-    The first three fields are all that a session needs. The others come with `weldscan-scanner/1`, the file that
-    `weldscan calibrate scanner` writes.
+    The first three fields are all that a session needs. The others come with `weldscan-scanner/2`, the file that
+    `weldscan calibrate scanner` writes; `weldscan-scanner/1` is the same without `hull`, `jackknife_ratio` and
+    `resolution`.
     """
 
     camera: LensSpec
     projector: LensSpec
     camera_from_projector: Rigid
-    schema_: Annotated[Literal["weldscan-scanner/1"] | None, Field(alias="schema")] = None
+    schema_: Annotated[Literal["weldscan-scanner/1", "weldscan-scanner/2"] | None, Field(alias="schema")] = None
     id: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     date: Annotated[str, Field(max_length=100)] | None = None
     valid_until: Day | None = None
@@ -67,6 +83,13 @@ class ScannerSpec(Model):
     board_sigma_mm: tuple[float, float] | None = None
     temperature_c: Annotated[float, Field(ge=-100, le=200)] | None = None
     covariance: CovarianceSpec | None = None
+    """Scaled by the jackknife already, where that exceeds it."""
+    jackknife_ratio: Annotated[float, Field(ge=0, le=1e9)] | None = None
+    """By leaving out poses over by noise, of the uncertainty of the volume's shape."""
+    hull: HullSpec | None = None
+    """Absent: not known."""
+    resolution: dict[str, Any] | None = None
+    """How far an edge is spread; nothing reads it yet."""
     rms_px: dict[str, float] | None = None
     volume: tuple[dict[str, Any], ...] | None = None
     """Uncertainty of points, for the record."""
@@ -105,7 +128,7 @@ def read_scanner(path: str | os.PathLike[str]) -> ScannerSpec:
 
 
 def write_scanner(path: str | os.PathLike[str], found: ScannerCalibration) -> ScannerSpec:
-    """Keeps a scanner's calibration as `weldscan-scanner/1`; the file appears complete or not at all.
+    """Keeps a scanner's calibration as `weldscan-scanner/2`; the file appears complete or not at all.
 
     Returns:
         The document as read back.
@@ -117,6 +140,8 @@ def write_scanner(path: str | os.PathLike[str], found: ScannerCalibration) -> Sc
     if path.exists():
         try:
             read_scanner(path)
+        except Unreadable:
+            raise
         except InputError as error:
             raise InputError(
                 f"{path}: exists and is no scanner's calibration: remove it or name another ({error})"
@@ -146,6 +171,12 @@ def write_scanner(path: str | os.PathLike[str], found: ScannerCalibration) -> Sc
         **lenses,
         "camera_from_projector": found.camera_from_projector,
         "covariance": {"parameters": found.parameters, "matrix": found.covariance},
+        "jackknife_ratio": found.jackknife_ratio,
+        "hull": {
+            "camera_px": found.hull.camera_px,
+            "projector_px": found.hull.projector_px,
+            "depth_mm": found.hull.depth_mm,
+        },
         "rms_px": dict(zip(("camera", "projector", "both"), found.rms_px, strict=True)),
         "volume": [
             {"name": p.name, "point_mm": p.point_mm, "u_mm": p.u_mm, "shape_u_mm": p.shape_u_mm} for p in found.volume

@@ -165,7 +165,7 @@ class Session(Model):
     schema_: Literal["weldscan-session/1"] = Field(alias="schema")
     name: Annotated[str, Field(min_length=1, max_length=200)]
     scanner: ScannerSpec
-    """In the file also the name of a `weldscan-scanner/1` document in the session's folder."""
+    """In the file also the name of a `weldscan-scanner/2` document in the session's folder."""
     fringes: Annotated[tuple[FringeSet, ...], Field(min_length=1, max_length=100)]
     artefact: ArtefactSpec | None = None
     hand_eye: HandEyeSpec | Annotated[str, Field(min_length=1, max_length=200)] | None = None
@@ -325,7 +325,7 @@ def write_session(
         frames: per shot its name and its images, as `read_frames` gives them; may be a generator, so that one shot
             after the other is made and written. `dict.items()` does as well.
         whites: per shot the evenly lit image of each exposure, where there is one.
-        extra: further text files by name, `touch.csv` for one.
+        extra: further text files by name, `touch.csv` for one; written last, so that `frames` may still add to them.
 
     Returns:
         The session as read back from `folder`.
@@ -337,8 +337,6 @@ def write_session(
     with whole_folder(folder) as whole:
         document = session.model_dump(mode="json", exclude_none=True, by_alias=True)
         write_synced(whole / "session.json", to_json(document))
-        for name, text in (extra or {}).items():
-            write_synced(whole / plain_name(name), text)
         shots = {shot.name: shot for shot in session.shots}
         camera = session.scanner.camera
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
@@ -361,6 +359,8 @@ def write_session(
                 list(pool.map(_write_image, targets, images, [size] * len(images)))
         if shots:
             raise InputError(f"frames: none for shot {next(iter(shots))!r}")
+        for name, text in (extra or {}).items():
+            write_synced(whole / plain_name(name), text)
     return read_session(folder)
 
 

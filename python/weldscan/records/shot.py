@@ -14,9 +14,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from weldscan.errors import InputError
-from weldscan.records.fields import read_model
-from weldscan.records.files import read_bytes
+from weldscan.errors import InputError, Unreadable
+from weldscan.records.fields import parse_model
+from weldscan.records.files import listed, parse_json, read_bytes, read_text
 from weldscan.records.images import MAX_IMAGE_BYTES
 from weldscan.records.plan import planned
 from weldscan.records.session import ShotSpec
@@ -38,9 +38,28 @@ class ShotManifest(BaseModel):
     """How it was taken: poses before and after, exposures, quality, times. For the record; nothing reads it."""
 
 
+class NotUnderstood(InputError):
+    """A shot's manifest is JSON, but not as this weldscan knows it: that says nothing about the shot's images."""
+
+
 def read_manifest(folder: Path) -> ShotManifest:
-    """Read a shot's manifest and hold every file against it. Raises `InputError`, naming what is not whole."""
-    manifest = read_model(folder / SHOT, ShotManifest)
+    """Read a shot's manifest and hold every file against it.
+
+    A shot on disk is in one of three states: whole, provably different from what was taken, or nobody knows. The first
+    is returned, and each of the others has errors of its own.
+
+    Raises:
+        InputError: a file is missing, is no regular file, is no JSON, or its SHA-256 is another: it is different.
+        Unreadable: the system does not give a file: nobody knows.
+        NotUnderstood: a field of the manifest is unknown or wrong: nobody knows either.
+    """
+    path = folder / SHOT
+    text = read_text(path)
+    parse_json(text, path)
+    try:
+        manifest = parse_model(text, ShotManifest, path)
+    except InputError as error:
+        raise NotUnderstood(str(error)) from None
     for name, expected in manifest.files.items():
         found = hashlib.sha256(read_bytes(folder / name, MAX_IMAGE_BYTES)).hexdigest()
         if found != expected:
@@ -69,24 +88,27 @@ def faults(folder: str | os.PathLike[str]) -> tuple[Fault, ...]:
 
     Raises:
         InputError: the plan cannot be read.
+        Unreadable: nor a file of a shot.
     """
     folder = Path(folder)
     found: dict[str, Fault] = {}
     shots = folder / "shots"
-    for manifest in sorted(shots.glob(f"*/{SHOT}")) if shots.is_dir() else ():
-        name = manifest.parent.name
-        if name.startswith("."):
+    there = {entry.name: entry for entry in listed(shots) if not entry.name.startswith(".")}
+    for name, shot in there.items():
+        if not (shot / SHOT).is_file():
             continue
         try:
-            read_manifest(manifest.parent)
+            read_manifest(shot)
+        except Unreadable:
+            raise
         except InputError as error:
             found[name] = Fault(name, "shot-altered", str(error))
     plan = planned(folder)
     for name in () if plan is None else (shot.name for shot in plan.shots):
-        if not (shots / name).is_dir():
+        if name not in there or not there[name].is_dir():
             reason = "planned, but not scanned: weldscan scan --resume goes on"
             found.setdefault(name, Fault(name, "shot-missing", reason))
-        elif not (shots / name / SHOT).is_file():
+        elif not (there[name] / SHOT).is_file():
             reason = f"its {SHOT} is missing, so nobody knows whether it is whole"
             found.setdefault(name, Fault(name, "shot-altered", reason))
     return tuple(found.values())

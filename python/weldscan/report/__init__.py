@@ -357,8 +357,8 @@ def _matrix(hand_eye: HandEye | None) -> str:
     )
 
 
-MASKS = ("ok", "dark", "saturated", "order in doubt", "no fit")
-BARS = ("ok", "dark", "saturated", "doubt", "nofit")
+MASKS = ("ok", "dark", "saturated", "order in doubt", "no fit", "outside calibration")
+BARS = ("ok", "dark", "saturated", "doubt", "nofit", "outside")
 
 
 def _masks(masks: Mapping[str, Mapping[str, int]]) -> list[tuple[str, list[str], list[tuple[str, float]]]]:

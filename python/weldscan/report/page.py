@@ -10,7 +10,7 @@ from typing import Any
 
 from weldscan._weldcore import __version__
 from weldscan.errors import InputError
-from weldscan.records.files import read_bytes, write_file
+from weldscan.records.files import check_file, read_bytes, write_file
 
 MARK = '<meta name="generator" content="weldscan calibrate">'
 
@@ -57,5 +57,4 @@ def check_page(path: Path) -> None:
     """Says early what would be in the way of a page."""
     if path.exists() and (not path.is_file() or MARK.encode() not in read_bytes(path)[:2000]):
         raise InputError(f"{path}: exists and is no page of a calibration: remove it or name another")
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path}: cannot be written: {path.absolute().parent} is not a folder")
+    check_file(path)

@@ -68,6 +68,9 @@ def vectors(found: ScannerCalibration, poses: tuple[BoardPose, ...], device: int
     shrink = PANEL / width
     svg = Svg(PANEL, height * shrink, f"Residuals in the {('camera', 'projector')[device]}'s image")
     svg.add("rect", x=0.5, y=0.5, width=PANEL - 1.0, height=height * shrink - 1.0, class_="panel")
+    corners = (found.hull.camera_px, found.hull.projector_px)[device] * shrink
+    for (x, y), (p, q) in zip(corners.tolist(), np.roll(corners, -1, axis=0).tolist(), strict=True):
+        svg.line(x, y, p, q, "grid")
     for pose in poses:
         pixels, residuals, used = _residuals(pose, device)
         for (x, y), (dx, dy), good in zip(pixels * shrink, residuals * shrink * scale, used, strict=True):

@@ -7,7 +7,14 @@ from weldscan.result.cloud import Label, PartCloud
 from weldscan.result.findings import CODES, Finding, Severity, bar, note, warning
 from weldscan.result.hand_eye import ArtefactShot, ArtefactSphere, HandEye
 from weldscan.result.inspection import Inspection, ScannerRecord, ShotAgreement
-from weldscan.result.scanner import BoardPose, NextPose, ScannerCalibration, VolumePoint
+from weldscan.result.scanner import (
+    BoardPose,
+    CalibratedHull,
+    NextPose,
+    ScannerCalibration,
+    StandardWeld,
+    VolumePoint,
+)
 from weldscan.result.seam import FATES, WHOLE_TURN_DEG, Coverage, SeamBin
 from weldscan.result.standing import Standing
 from weldscan.result.step import BudgetLine, Histogram, StepResult
@@ -24,6 +31,7 @@ __all__ = [
     "BallError",
     "BoardPose",
     "BudgetLine",
+    "CalibratedHull",
     "Characteristic",
     "Coverage",
     "Drift",
@@ -42,6 +50,7 @@ __all__ = [
     "Severity",
     "ShotAgreement",
     "SpacingError",
+    "StandardWeld",
     "Standing",
     "StepResult",
     "Validation",

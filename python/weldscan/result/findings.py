@@ -19,7 +19,7 @@ class Severity(StrEnum):
 
 CODES = {
     "agreement": "shots placed in base disagree by less than what bars, more than their uncertainty",
-    "calibration": "the scanner's calibration: not stated, out of date, not determined, or larger than the margin",
+    "calibration": "the scanner's calibration: not stated, out of date, undetermined, elsewhere, or beyond the margin",
     "cap": "what lies between the walls is not one cap of a weld: too wide, two-humped, toes that jump, two seams",
     "clipped": "the camera clips below its full scale",
     "coverage": "less of the seam was seen than is required",

@@ -78,8 +78,45 @@ class NextPose:
 
 
 @dataclass(frozen=True, eq=False)
+class CalibratedHull:
+    """Where a scanner is calibrated: the convex hulls of the board's features in both images, and their depths."""
+
+    camera_px: Floats
+    """(n, 2), corners in order."""
+    projector_px: Floats
+    """(m, 2)"""
+    depth_mm: tuple[float, float]
+    """Nearest and furthest feature, along the camera's axis."""
+
+    def holds(self, camera_px: Floats, projector_px: Floats) -> NDArray[np.bool_]:
+        """Which places lie in both, (n, 2) each; NaN lies in none."""
+        inside = np.ones(len(camera_px), dtype=bool)
+        for corners, places in ((self.camera_px, camera_px), (self.projector_px, projector_px)):
+            sides = np.roll(corners, -1, axis=0) - corners
+            x, y = corners.T
+            way = np.sign(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+            off = places[:, None] - corners
+            inside &= (way * (sides[:, 0] * off[..., 1] - sides[:, 1] * off[..., 0]) >= 0).all(axis=1)
+        return inside
+
+
+@dataclass(frozen=True)
+class StandardWeld:
+    """What a calibration leaves unknown of a pipe of 219 mm in the middle of where the boards stood."""
+
+    u_mm: float
+    """Of its step, k = 1; inf: it is not in view."""
+    inside: float
+    """Which share of its walls lies in the hull of the calibrated pixels."""
+    deep_enough: float
+    """And which between the nearest and the furthest feature."""
+    distance_mm: float
+    """Of the weld from the camera."""
+
+
+@dataclass(frozen=True, eq=False)
 class ScannerCalibration:
-    """A scanner as calibrated: what `weldscan-scanner/1` keeps, and what its report shows."""
+    """A scanner as calibrated: what `weldscan-scanner/2` keeps, and what its report shows."""
 
     id: str
     date: str
@@ -92,7 +129,8 @@ class ScannerCalibration:
     values: Floats
     """In the order of `parameters`; the turn as a rotation vector (rad)."""
     covariance: Floats
-    """Of `parameters`; rotations are small turns about the camera's axes, R_true = exp(w) R."""
+    """Of `parameters`; rotations are small turns about the camera's axes, R_true = exp(w) R. Times the square of
+    `jackknife_ratio` where that is above 1."""
     camera_from_projector: Floats
     """(4, 4)"""
     rms_px: tuple[float, float, float]
@@ -111,7 +149,11 @@ class ScannerCalibration:
     jackknife_mm: float | None
     """Standard uncertainty of the volume's shape (rms) by leaving out one pose after the other."""
     shape_u_mm: float
-    """The same by the covariance."""
+    """The same by the noise of the features, before the covariance was scaled."""
+    jackknife_ratio: float | None
+    """`jackknife_mm` over `shape_u_mm`; None: too few poses to leave one out."""
+    hull: CalibratedHull
+    weld: StandardWeld
     undetermined: tuple[str, ...]
     """Parameters that the poses do not determine."""
     next_pose: NextPose | None

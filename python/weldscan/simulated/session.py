@@ -7,7 +7,6 @@ import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -215,10 +214,9 @@ def simulate_session(
             probed = np.concatenate(surface)[: cell.touched_points]
             probed += random.normal(0.0, cell.probe_noise_mm, probed.shape)
             extra["touch.csv"] = "x_mm,y_mm,z_mm\n" + "".join(f"{x:.4f},{y:.4f},{z:.4f}\n" for x, y, z in probed)
+        extra["truth.json"] = json.dumps(truth, indent=1)
 
-    write_session(folder, session, frames(), whites=whites)
-    for name, text in (extra | {"truth.json": json.dumps(truth, indent=1)}).items():
-        (Path(folder) / name).write_text(text, encoding="utf-8")
+    write_session(folder, session, frames(), whites=whites, extra=extra)
     if progress is not None:
         progress(len(shots), len(shots), "session written")
     return truth

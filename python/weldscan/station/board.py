@@ -90,7 +90,7 @@ def capture_board(cell: CellConfig, folder: Path, board: str | None, tell: Tell,
             _go(settings, robot, number, operator)
             tell(number, count, f"taking {name}")
             images = capture_stack(camera, projector, patterns)
-            _refuse(name, judge([images], sets, settings.least_modulation), settings)
+            _refuse(name, judge([images], sets, settings.least_modulation, camera.full_scale), settings)
             _keep(partial / "shots" / name, images)
         tell(count, count, "captured")
 

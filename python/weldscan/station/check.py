@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldscan.calibration.response import response_of_ramp
-from weldscan.devices.cameras import Camera, Image
+from weldscan.devices.cameras import Camera, Frame, Image
 from weldscan.devices.projectors import Projector
 from weldscan.devices.projectors.patterns import flat_pattern
 from weldscan.errors import DeviceError, DeviceTimeout
 from weldscan.records.files import write_file
 from weldscan.records.images import encode_png
 from weldscan.records.response import Response
-from weldscan.station.capture import full_scale, set_exposure
+from weldscan.station.capture import set_exposure
 
 LONGEST_LATENCY_S = 2.0
 REST_S = 0.3
@@ -46,7 +46,7 @@ def latency_s(camera: Camera, projector: Projector, repeats: int = 5) -> tuple[f
     """
     black, white = _flats(camera, projector)
     low, high = float(black.mean()), float(white.mean())
-    if high - low < LEAST_CONTRAST * full_scale([black, white]):
+    if high - low < LEAST_CONTRAST * camera.full_scale:
         raise DeviceError(f"{camera.name} does not see {projector.name}: black {low:.1f}, white {high:.1f}")
     found = []
     for _ in range(repeats):
@@ -62,6 +62,24 @@ def latency_s(camera: Camera, projector: Projector, repeats: int = 5) -> tuple[f
     return tuple(found)
 
 
+def transfer_s(camera: Camera, projector: Projector, repeats: int = 5) -> tuple[float, ...]:
+    """Return, per repeat, seconds from `show` until the first frame of a camera that streams shows anything of the new
+    pattern: such a frame was under way for no longer than that. The projector's latency is in it, so never too short.
+    """
+    black, white = _flats(camera, projector)
+    seen = float(black.mean()) + (1 - ARRIVED) * (float(white.mean()) - float(black.mean()))
+    found = []
+    for _ in range(repeats):
+        _show(projector, 0, REST_S)
+        camera.capture()  # nothing from before is in the queue
+        shown_s = projector.show(_flat(projector, 255))
+        while (frame := camera.next_frame()).image.mean() < seen:
+            if frame.time_s - shown_s > LONGEST_LATENCY_S:
+                raise DeviceTimeout(f"{projector.name}: no white within {LONGEST_LATENCY_S:g} s")
+        found.append(frame.time_s - shown_s)
+    return tuple(found)
+
+
 def response(
     camera: Camera, projector: Projector, levels: int = 18, frames: int = 3, keep: Path | None = None
 ) -> Response:
@@ -70,7 +88,7 @@ def response(
     An image of each level is left in the folder `keep`, for `weldscan calibrate response`.
     """
     black, white = _flats(camera, projector)
-    top = full_scale([black, white])
+    top = camera.full_scale
     lit = (white < top) & (white.astype(np.int64) - black > LEAST_CONTRAST * top)
     if not lit.any():
         raise DeviceError(f"{camera.name}: no pixel is lit and unsaturated; change the exposure")
@@ -93,17 +111,17 @@ def gamma(response: Response) -> float:
 def pixels(camera: Camera, projector: Projector) -> Pixels:
     """Return which share of the image is saturated or dark."""
     black, white = _flats(camera, projector)
-    top = full_scale([black, white])
+    top = camera.full_scale
     return Pixels(
         saturated=float((white >= top).mean()),
         dark=float((white.astype(np.int64) - black <= LEAST_CONTRAST * top).mean()),
     )
 
 
-def overlay(image: Image, least: float = LEAST_CONTRAST) -> NDArray[np.uint8]:
+def overlay(frame: Frame, least: float = LEAST_CONTRAST) -> NDArray[np.uint8]:
     """Return a BGR picture for the operator: saturated pixels red, dark ones blue."""
-    top = full_scale([image])
-    grey = (image // max(top // 255, 1)).clip(0, 255).astype(np.uint8)
+    image, top = frame.image, frame.full_scale
+    grey = np.asarray(image / (top / 255), dtype=np.uint8)
     picture = np.repeat(grey[:, :, None], 3, axis=2)
     picture[image >= top] = (0, 0, 255)
     picture[image <= least * top] = (160, 0, 0)

@@ -2,18 +2,20 @@
 
 At each pose: move, or wait for the operator; wait until the robot stands; read the pose, take the images, read the pose
 again - a robot that moved rejects the shot; look at the quality, once more with another exposure where that helps; keep
-the shot.
+the shot, which is written while the robot goes to the next.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, suppress
+from dataclasses import asdict, dataclass, field
+from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -23,12 +25,13 @@ from weldscan.devices.projectors.patterns import flat_pattern, fringe_patterns
 from weldscan.devices.robots import Robot, StampedPose, distance, wait_until_still
 from weldscan.errors import DeviceError, InputError, WeldscanError
 from weldscan.pose import KukaPose
+from weldscan.records.files import own_file
 from weldscan.records.hand_eye import read_hand_eye
 from weldscan.records.plan import read_plan
 from weldscan.records.session import FlangePose, Session, ShotSpec
-from weldscan.station.capture import Quality, capture_stack, judge, set_exposure
+from weldscan.station.capture import Quality, Stopwatch, capture_stack, judge, set_exposure
 from weldscan.station.cell import CellConfig, check
-from weldscan.station.store import LOG, ShotStore
+from weldscan.station.store import LOG, SetAside, ShotStore
 
 Tell = Callable[[int, int, str], None]
 Operator = Callable[[ShotSpec], None]
@@ -68,6 +71,11 @@ class ScanResult:
     planned: int
     rejected: tuple[tuple[str, str], ...]
     """Shots that were tried and not kept, with the reason."""
+    set_aside: tuple[SetAside, ...] = ()
+    """Shots that were there and damaged: why, and where they are now."""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """Where the time of the shots went, all together: motion, standing, projector, camera, judging; and writing, which
+    goes on beside them."""
 
 
 class Rejected(WeldscanError):
@@ -80,6 +88,7 @@ def scan(
     resume: bool = False,
     tell: Tell = lambda done, of, what: None,
     operator: Operator | None = None,
+    retake: bool = False,
 ) -> ScanResult:
     """Scan what the plan says and is not there yet.
 
@@ -87,26 +96,30 @@ def scan(
         cell: which devices, which plan.
         out: the session folder; new, or with `resume` one that an earlier scan of the same plan began.
         resume: go on with that.
-        tell: called with (whole shots, planned shots, what is being done).
+        tell: called with (whole shots, planned shots, what is being done); from another thread when a shot is kept.
         operator: called before a shot when weldscan may not move the robot; returns when the robot is at its pose.
+        retake: set aside more than one damaged shot, too.
 
     Raises:
-        InputError: configuration, plan or folder. DeviceError: a device failed; the shots so far are kept.
+        InputError: configuration, plan or folder. Unreadable: a shot that is there; nothing was touched.
+        DeviceError: a device failed; the shots so far are kept.
     """
     settings, plan = read_settings(cell)
     for kind in ("projector", "camera", *(["robot"] if plan.has_robot else [])):
         cell.settings(kind)  # a wrong configuration is told before anything is written
-    with ShotStore(out, plan, resume) as store, _log_to(out / LOG), ExitStack() as devices:
+    with ShotStore(out, plan, resume, retake) as store, _log_to(out / LOG), ExitStack() as devices:
         log.info("scan of %d shots, %d are there", len(plan.shots), len(store.whole))
-        for name, reason in store.redone.items():
-            log.warning("%s is taken again: %s", name, reason)
+        for each in store.set_aside:
+            log.warning("%s is taken again: %s; it was moved to %s", each.shot, each.reason, each.folder)
+            tell(len(store.whole), len(plan.shots), f"set aside {each.shot} as {each.folder}: {each.reason}")
         if not store.missing:
             return ScanResult(out, len(store.whole), len(plan.shots), ())
         try:
             projector: Projector = devices.enter_context(cell.open("projector"))
             camera: Camera = devices.enter_context(cell.open("camera"))
             robot: Robot | None = devices.enter_context(cell.open_robot()) if plan.has_robot else None
-            return _Scan(settings, plan, store, projector, camera, robot, tell, operator).run()
+            with _Scan(settings, plan, store, projector, camera, robot, tell, operator) as scanning:
+                return scanning.run()
         except BaseException as error:
             log.error(
                 "stopped with %d of %d shots: %s", len(store.whole), len(plan.shots), str(error) or type(error).__name__
@@ -131,6 +144,9 @@ class _Scan:
         self.settings, self.plan, self.store = settings, plan, store
         self.projector, self.camera, self.robot = projector, camera, robot
         self.tell, self.operator = tell, operator
+        self.took = Stopwatch()
+        self._writer = ThreadPoolExecutor(1, "writer")
+        self._writing: Future[None] | None = None
         self._before: tuple[KukaPose, KukaPose] | None = None
         """Where the shot before should have been taken, and where it was."""
         lens, size = plan.scanner.projector, (projector.settings.width, projector.settings.height)
@@ -138,6 +154,13 @@ class _Scan:
             raise InputError(f"projector: {size[0]}x{size[1]}, but the plan's has {lens.width}x{lens.height} pixels")
         self.sets = [(fringe.axis, fringe.periods, fringe.steps) for fringe in plan.fringes]
         self.patterns = [*fringe_patterns([f.pattern for f in plan.fringes], *size), flat_pattern(255, *size)]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """A shot that is being written is written to its end, whatever ended the scan."""
+        self._writer.shutdown(wait=True)
 
     def run(self) -> ScanResult:
         rejected = []
@@ -148,22 +171,28 @@ class _Scan:
                 log.warning("%s rejected: %s", shot.name, error)
                 rejected.append((shot.name, str(error)))
                 self._say(f"rejected {shot.name}: {error}")
-            else:
-                log.info("kept %s", shot.name)
-                self._say(f"kept {shot.name}")
-        return ScanResult(self.store.folder, len(self.store.whole), len(self.plan.shots), tuple(rejected))
+        self._written()
+        log.info("seconds: %s", self.took)
+        whole, planned = len(self.store.whole), len(self.plan.shots)
+        return ScanResult(
+            self.store.folder, whole, planned, tuple(rejected), self.store.set_aside, dict(self.took.seconds)
+        )
 
     def _say(self, what: str) -> None:
         self.tell(len(self.store.whole), len(self.plan.shots), what)
 
     def _take(self, shot: ShotSpec) -> None:
         self._say(f"going to {shot.name}")
-        self._go(shot)
-        factor = 1.0
+        before, factor = dict(self.took.seconds), 1.0
+        with self.took("motion"):
+            self._go(shot)
+        self._written()
         for attempt in range(2):
             stacks, whites, exposures, record = self._images(shot, factor)
-            quality = judge(stacks, self.sets, self.settings.least_modulation)
+            with self.took("judging"):
+                quality = judge(stacks, self.sets, self.settings.least_modulation, self.camera.full_scale)
             log.info("%s: %s", shot.name, quality)
+            self._say(f"{shot.name}: {quality}")
             complaint, better = self._complaint(quality)
             if complaint is None:
                 break
@@ -173,7 +202,26 @@ class _Scan:
             factor = better
         pose = record.pop("pose")
         taken = shot.model_copy(update={"exposures": exposures, "flange_pose": pose})
-        self.store.keep(taken, stacks, whites, {**record, "quality": asdict(quality)})
+        record |= {"quality": asdict(quality), "seconds": self._since(before)}
+        self._writing = self._writer.submit(self._keep, taken, stacks, whites, record)
+
+    def _keep(self, *taken: Any) -> None:
+        """Write a shot, and say that it counts; the writer's."""
+        with self.took("writing"):
+            self.store.keep(*taken)
+        name = taken[0].name
+        log.info("kept %s", name)
+        self._say(f"kept {name}")
+
+    def _written(self) -> None:
+        """Wait for the shot that is being written; what went wrong with that stops the scan."""
+        if self._writing is not None:
+            self._writing.result()
+            self._writing = None
+
+    def _since(self, before: Mapping[str, float]) -> dict[str, float]:
+        """What the shot took so far."""
+        return {what: round(s - before.get(what, 0.0), 3) for what, s in self.took.seconds.items() if what != "writing"}
 
     def _go(self, shot: ShotSpec) -> None:
         if self.robot is None or not self.robot.settings.allow_motion:
@@ -190,7 +238,8 @@ class _Scan:
         for attempt in range(MOVED_ATTEMPTS):
             if attempt > 0:
                 self._go(shot)
-            before = self._standing()
+            with self.took("standing"):
+                before = self._standing()
             self._check_moved(shot, before)
             self._say(f"taking {shot.name}")
             started = time.strftime("%Y-%m-%dT%H:%M:%S%z")
@@ -198,14 +247,14 @@ class _Scan:
             for exposure in relative:
                 wanted_s = self.camera.settings.exposure_s * exposure * factor
                 actual.append(set_exposure(self.camera, self.projector, wanted_s))
-                *frames, white = capture_stack(self.camera, self.projector, self.patterns)
+                *frames, white = capture_stack(self.camera, self.projector, self.patterns, self.took)
                 self._check_size(white)
                 stacks.append(frames)
                 whites.append(white)
             if len(set(actual)) < len(actual):
                 raise InputError(f"{shot.name}: exposures: {relative} are not whole refreshes apart")
             after = None if self.robot is None else self.robot.pose()
-            record: dict[str, Any] = {"started": started, "exposures_s": actual}
+            record: dict[str, Any] = {"started": started, "exposures_s": actual, "full_scale": self.camera.full_scale}
             if before is None or after is None:
                 return stacks, whites, self._ratios(shot, actual), {**record, "pose": None}
             moved_mm, moved_deg = distance(before.flange, after.flange)
@@ -274,6 +323,13 @@ def read_settings(cell: CellConfig) -> tuple[ScanSettings, Session]:
 
 
 class _LogFile(logging.FileHandler):
+    def _open(self) -> TextIOWrapper:
+        return TextIOWrapper(own_file(Path(self.baseFilename)), encoding="utf-8")
+
+    def close(self) -> None:
+        with suppress(OSError):
+            super().close()
+
     def handleError(self, record: logging.LogRecord) -> None:
         """A log that cannot be written, on a full disk, says nothing of its own."""
 

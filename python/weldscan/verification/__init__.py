@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from weldscan._weldcore import __version__
 from weldscan.calibration.artefact import PlateMismatch
-from weldscan.errors import GeometryError, InputError
+from weldscan.errors import GeometryError, InputError, Unreadable
 from weldscan.measure.journal import Journal
 from weldscan.measure.scanner_standing import CLOCK_SKEW, fringes_of, scanner_id
 from weldscan.measure.session_hand_eye import base_from_flange
@@ -176,6 +176,8 @@ def _date(session: Session, date: str | None, now: datetime) -> tuple[datetime, 
             if (folder / "shot.json").is_file():
                 try:
                     started.append(moment(str(read_manifest(folder).record["started"]), f"{folder}/shot.json"))
+                except Unreadable:
+                    raise
                 except (InputError, KeyError):
                     continue
         if not started:

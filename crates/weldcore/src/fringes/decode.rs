@@ -67,7 +67,7 @@ pub fn decode_shot<T: Fuse>(
 ) -> Result<PhaseMap> {
     validate(shot, sets, projector_size, options)?;
     let plan = Plan::new(&sets.iter().map(|s| s.periods).collect::<Vec<_>>(), options.z)?;
-    let seen = options.saturation.is_none().then(|| saturation::saturation(shot));
+    let seen = options.saturation.is_none().then(|| saturation::saturation(shot, None));
     let saturation = options.saturation.or(seen.map(|s| s.level)).unwrap_or(f64::INFINITY);
     let noise = noise::estimate(shot, sets, saturation as f32);
     let phase_error = match &options.compensation {

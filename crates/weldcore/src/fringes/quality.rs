@@ -26,11 +26,16 @@ pub struct Quality {
     pub median_modulation: f64,
 }
 
-/// Judges a shot by the frames of its finest fringes.
+/// Judges a shot by the frames of its finest fringes; `full_scale` is that of the camera's numbers, where it is known.
 ///
 /// # Errors
 /// [`Error::Shape`] for frames of another size or `finest` beyond them, [`Error::TooFew`] for less than three of them or no pixel.
-pub fn quality<T: Level>(shot: &Shot<'_, T>, finest: Range<usize>, least_modulation: f64) -> Result<Quality> {
+pub fn quality<T: Level>(
+    shot: &Shot<'_, T>,
+    finest: Range<usize>,
+    least_modulation: f64,
+    full_scale: Option<u32>,
+) -> Result<Quality> {
     let pixels = shot.width * shot.height;
     crate::error::require_count("frames of the finest fringes", 3, finest.len())?;
     crate::error::require_count("pixels", 1, pixels)?;
@@ -45,7 +50,8 @@ pub fn quality<T: Level>(shot: &Shot<'_, T>, finest: Range<usize>, least_modulat
         .exposures
         .iter()
         .map(|frames| {
-            let found = saturation(&Shot { exposures: vec![frames.clone()], width: shot.width, height: shot.height });
+            let alone = Shot { exposures: vec![frames.clone()], width: shot.width, height: shot.height };
+            let found = saturation(&alone, full_scale);
             (found.level as u32, 2.0 / (finest.len() as f32 * found.full_scale as f32))
         })
         .collect();
@@ -111,7 +117,7 @@ mod tests {
 
     fn judged(exposures: &[Vec<Vec<u8>>], least: f64) -> Quality {
         let exposures = exposures.iter().map(|frames| frames.iter().map(Vec::as_slice).collect()).collect();
-        quality(&Shot { exposures, width: 40, height: 30 }, 2..6, least).unwrap()
+        quality(&Shot { exposures, width: 40, height: 30 }, 2..6, least, None).unwrap()
     }
 
     #[test]
@@ -133,11 +139,24 @@ mod tests {
     }
 
     #[test]
+    fn what_is_dark_for_the_camera_is_dark() {
+        let wide = |frames: Vec<Vec<u8>>| -> Vec<Vec<u16>> {
+            frames.into_iter().map(|frame| frame.into_iter().map(u16::from).collect()).collect()
+        };
+        let frames = wide(frames(160.0, 160.0));
+        let exposures = vec![frames.iter().map(Vec::as_slice).collect()];
+        let shot = Shot { exposures, width: 40, height: 30 };
+        assert_eq!(quality(&shot, 2..6, 0.1, None).unwrap().usable, 1.0);
+        let found = quality(&shot, 2..6, 0.1, Some(4095)).unwrap();
+        assert_eq!((found.usable, found.dark), (0.0, 1.0));
+    }
+
+    #[test]
     fn what_is_no_shot_is_refused() {
         let frame = vec![1_u8; 12];
         let shot = Shot { exposures: vec![vec![frame.as_slice(); 4]], width: 4, height: 3 };
-        assert!(quality(&shot, 2..5, 0.1).is_err() && quality(&shot, 0..2, 0.1).is_err());
-        assert!(quality(&Shot { width: 5, ..shot.clone() }, 0..4, 0.1).is_err());
-        assert_eq!(quality(&Shot { exposures: vec![], ..shot }, 0..4, 0.1).unwrap().saturated, 1.0);
+        assert!(quality(&shot, 2..5, 0.1, None).is_err() && quality(&shot, 0..2, 0.1, None).is_err());
+        assert!(quality(&Shot { width: 5, ..shot.clone() }, 0..4, 0.1, None).is_err());
+        assert_eq!(quality(&Shot { exposures: vec![], ..shot }, 0..4, 0.1, None).unwrap().saturated, 1.0);
     }
 }

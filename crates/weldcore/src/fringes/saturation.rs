@@ -46,10 +46,12 @@ pub struct Saturation {
 /// Where the camera saturates, by its data: the full scale of its numbers, or below it where values are piled up. 8-bit
 /// images have 255. 16-bit images often hold fewer bits: the full scale of the narrowest of 8, 10, 12, 14 and 16 bits that
 /// holds the largest value, after a shift by the low bits that are zero in every pixel. Should this guess a narrower scale
-/// than the camera's, then at most pixels of exactly the largest value seen are lost.
-pub fn saturation<T: Level>(shot: &Shot<'_, T>) -> Saturation {
+/// than the camera's, then at most pixels of exactly the largest value seen are lost. `full_scale` is that of the camera's
+/// numbers where it is known; nothing is guessed then.
+pub fn saturation<T: Level>(shot: &Shot<'_, T>, full_scale: Option<u32>) -> Saturation {
     let frames: Vec<&[T]> = shot.exposures.iter().flatten().copied().collect();
-    let (full, bits) = scale_of(&frames);
+    let (guessed, bits) = scale_of(&frames);
+    let full = full_scale.map_or(guessed, |full| full.clamp(1, T::FULL));
     let per_bin = (full / BINS + 1).next_power_of_two();
     let rows: Vec<usize> = sample_rows(shot.height).step_by(EVERY).collect();
     let counts = histogram(&frames, &rows, shot.width, per_bin, full);

@@ -199,7 +199,8 @@ structs! {
     WallRun { from, to, height, slope, shrinkage, rms, slope_u, centre, shell_mm }
     Edge { step_mm, standard_mm, hull_mm, foot_mm }
     Station {
-        at, seen, kind, by_course, toes_mm, toes_standard_mm, height_mm, edge, undisturbed_mm, departure_mm, wall_step_mm, walls,
+        at, seen, kind, by_course, toes_mm, toes_standard_mm, height_mm, edge, local_step_mm, undisturbed_mm, departure_mm,
+        wall_step_mm, walls,
     }
     Doubt { code, at, text }
     Sections { grid, stations, station_mm, doubts, cap_width_mm, cap_height_mm, noise_mm }

@@ -5,8 +5,8 @@ mod paper;
 mod whitening;
 
 use numpy::{
-    IntoPyArray, Ix3, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArrayDyn,
-    PyUntypedArrayMethods,
+    IntoPyArray, IxDyn, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
+    PyReadonlyArrayDyn, PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -97,7 +97,8 @@ impl WeldShot {
     /// (middle of the station, as a reading of the seam; also as `angle_deg`), `seen` (bool), `kind` (uint8: 0 unknown, 1 raised, 2 hollow, 3 flush), `by_course` (bool: the
     /// toes are those of the seam's course), `toes_mm` (n, 2) from the seam's centreline, reference side first, with their standard uncertainty
     /// `toes_standard_mm` (n, 2), `height_mm` of the cap, `edge_step_mm` (other over reference, right beside the toes), `edge_standard_mm` (k = 1), `edge_hull_mm` (what the
-    /// choice of the toes may hide, in full), `undisturbed_mm` (n, 2): from where outward the walls are undisturbed,
+    /// choice of the toes may hide, in full), `local_step_mm` (how far the surfaces' step is off that of both neighbours read at the
+    /// same places, 0 where that is noise), `undisturbed_mm` (n, 2): from where outward the walls are undisturbed,
     /// `departure_mm` (n, 2): of the transition from the straight wall, `wall_step_mm` of both straight walls.
     #[getter]
     fn sections<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
@@ -123,6 +124,7 @@ impl WeldShot {
         out.set_item("edge_step_mm", one(&|s| s.edge.map(|e| e.step_mm)))?;
         out.set_item("edge_standard_mm", one(&|s| s.edge.map(|e| e.standard_mm)))?;
         out.set_item("edge_hull_mm", one(&|s| s.edge.map(|e| e.hull_mm)))?;
+        out.set_item("local_step_mm", one(&|s| s.local_step_mm))?;
         out.set_item("undisturbed_mm", two(&|s| s.undisturbed_mm)?)?;
         out.set_item("departure_mm", two(&|s| s.departure_mm.map(Some))?)?;
         out.set_item("wall_step_mm", one(&|s| s.wall_step_mm))?;
@@ -156,7 +158,8 @@ fn direction(py: Python<'_>, what: &'static str, given: Option<&Bound<'_, PyAny>
 
 /// Cuts one part shot into reference wall, other wall and bead, without seeds.
 ///
-/// points_mm: (H, W, 3) float64, NaN where there is no point, one frame (the scanner's: the scanner stands at its origin).
+/// points_mm: (H, W, 3) float64, NaN where there is no point, or a cloud (n, 3) in any order; one frame (the scanner's: the
+/// scanner stands at its origin).
 /// radius_mm, wall_thickness_mm: the pipe's nominal ones. axis: (3,), from the reference wall to the other wall, in the
 /// frame of the points, within some degrees; None: from the points. zero: (3,), towards angle 0; None: angle 0 faces the
 /// scanner. Returns a WeldShot. Raises InputError on bad arguments, GeometryError with the reason where no weld or
@@ -171,20 +174,21 @@ fn segment_weld(
     axis: Option<&Bound<'_, PyAny>>,
     zero: Option<&Bound<'_, PyAny>>,
 ) -> PyResult<WeldShot> {
-    let points_mm = floats::<Ix3>("points_mm", points_mm)?;
-    let shape = points_mm.shape().to_vec();
+    let points_mm = floats::<IxDyn>("points_mm", points_mm)?;
     let wrong = |got: String| {
-        let expected = "an array of shape (H, W, 3)".into();
+        let expected = "an array of shape (H, W, 3) or (n, 3)".into();
         raise(py, &Error::Shape { what: "points_mm", expected, got })
     };
-    if shape[2] != 3 {
-        return Err(wrong(format!("shape {shape:?}")));
-    }
+    let width = match *points_mm.shape() {
+        [_, 3] => 1,
+        [_, width, 3] => width,
+        ref shape => return Err(wrong(format!("shape {shape:?}"))),
+    };
     let points = points_mm.as_slice().map_err(|_| wrong("strided".into()))?.as_chunks::<3>().0;
     let (axis, zero) = (direction(py, "axis", axis)?, direction(py, "zero", zero)?);
     let segmented = compute(py, || {
         let course = Course::of_radius(radius_mm)?;
-        segment::segment(points, shape[1], &Nominal { course, wall_thickness_mm, axis, zero })
+        segment::segment(points, width, &Nominal { course, wall_thickness_mm, axis, zero })
     });
     segmented.map(WeldShot)
 }
@@ -274,13 +278,14 @@ type PlacedShot<'py> =
     (PyRef<'py, WeldShot>, PyReadonlyArrayDyn<'py, f64>, PyReadonlyArray2<'py, f64>, PyReadonlyArray1<'py, f32>, Whole);
 
 /// The tables of `seam_fates`.
-type Tables<'py> = (Bound<'py, PyArray2<u32>>, Bound<'py, PyArray2<u32>>);
+type Tables<'py> = (Bound<'py, PyArray2<u32>>, Bound<'py, PyArray2<u32>>, Bound<'py, PyArray3<u32>>);
 
 /// Counts what became of every pixel of a part shot, bin by bin along the seam.
 ///
 /// shot: WeldShot. reason: (H, W) uint8, as `PhaseMap.reason`. scanner: whose camera took it. Returns two (180, 12) uint32
 /// arrays over the bins of 2 degrees (centred on even ones) and `weldscan.result.FATES`: of all pixels, and of those on the
-/// weld and within 8 mm of its toes. A pixel without a point lies where its ray meets the reference wall's cylinder. Raises
+/// weld and within 8 mm of its toes; and (180, cells, 2) uint32 of the latter in equal cells of about half a station: pixels,
+/// and those with a point. A pixel without a point lies where its ray meets the reference wall's cylinder. Raises
 /// InputError where the arrays are not those of one image. Source: `crates/weldcore/src/seam_fates.rs`.
 #[pyfunction]
 fn seam_fates<'py>(
@@ -297,7 +302,9 @@ fn seam_fates<'py>(
         let n = rows.len();
         rows.into_flattened().into_pyarray(py).reshape([n, crate::weld::seam_fates::FATES])
     };
-    Ok((table(found.all)?, table(found.near)?))
+    let shape = [found.all.len(), found.cells.len() / found.all.len(), 2];
+    let cells = found.cells.into_flattened().into_pyarray(py).reshape(shape)?;
+    Ok((table(found.all)?, table(found.near)?, cells))
 }
 
 /// Looks at the reference wall of a segmented shot: how far it tells the direction and place of a cylinder fitted to it.

@@ -4,6 +4,7 @@ use nalgebra::Matrix3;
 use rayon::prelude::*;
 
 use super::seam::{Course, Seam};
+use crate::clouds::normals;
 use crate::error::{Error, Result, require_count};
 use crate::ground::robust::{MEDIAN_TO_SIGMA, TUKEY_SIGMAS, median, tukey};
 use crate::ground::stop::polled;
@@ -12,6 +13,9 @@ use crate::ground::transform::Vec3;
 
 /// Normals that the coarse frame is found from.
 const COARSE_POINTS: f64 = 20_000.0;
+
+/// Neighbours that a normal of a bare point is of.
+const CLOUD_NEIGHBOURS: usize = 16;
 
 /// What is known of the part before it is scanned, in the frame of the points.
 #[derive(Debug, Clone, Copy)]
@@ -38,10 +42,9 @@ fn normal(points: &[[f64; 3]], width: usize, row: usize, column: usize, reach: u
     Some(if n.dot(&here) > 0.0 { -n } else { n })
 }
 
-/// A cylinder of the nominal radius near the points: axis from the normals, place from a vote of `p - R n`, both then
-/// refined with the points that agree. Degrees and millimetres suffice.
-pub(super) fn coarse_frame(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<Seam> {
-    // Normals over a twentieth of the radius, at most: the surface must be nearly flat there, and longer is less noisy.
+/// Points of a grid with their normals, over a twentieth of the radius at most: the surface must be nearly flat there, and
+/// longer is less noisy.
+fn of_grid(points: &[[f64; 3]], width: usize) -> Vec<(Vec3, Vec3)> {
     let height = points.len() / width;
     let stride = ((points.len() as f64 / COARSE_POINTS).sqrt() as usize).max(1);
     let reach = (width.min(height) / 100).clamp(1, 8);
@@ -55,7 +58,23 @@ pub(super) fn coarse_frame(points: &[[f64; 3]], width: usize, nominal: &Nominal)
             })
             .collect()
     });
-    let seen: Vec<(Vec3, Vec3)> = found.into_iter().flatten().collect();
+    found.into_iter().flatten().collect()
+}
+
+/// Points in any order with their normals, a sample of them.
+fn of_cloud(points: &[[f64; 3]]) -> Result<Vec<(Vec3, Vec3)>> {
+    let stride = points.len().div_ceil(COARSE_POINTS as usize).max(1);
+    let sample: Vec<[f64; 3]> = points.iter().step_by(stride).filter(|p| p[0].is_finite()).copied().collect();
+    require_count("part points", 100, sample.len())?;
+    let normals = normals::of_cloud(&sample, CLOUD_NEIGHBOURS, [0.0; 3])?;
+    let pairs = sample.iter().zip(normals).map(|(p, n)| (Vec3::from(*p), Vec3::from(n)));
+    Ok(pairs.filter(|(_, n)| n.x.is_finite()).collect())
+}
+
+/// A cylinder of the nominal radius near the points, a grid or bare ones in one column or row: axis from the normals, place from a
+/// vote of `p - R n`, both then refined with the points that agree. Degrees and millimetres suffice.
+pub(super) fn coarse_frame(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<Seam> {
+    let seen = if width == 1 || width == points.len() { of_cloud(points)? } else { of_grid(points, width) };
     require_count("part points with a normal", 100, seen.len())?;
     let axis = axis_from_normals(&seen, nominal)?;
     let middle = seen.iter().map(|(p, _)| p).sum::<Vec3>() / seen.len() as f64;

@@ -155,7 +155,18 @@ impl Course {
     /// The bin of a place.
     #[inline]
     pub fn bin(self, at: f64) -> usize {
-        ((at.to_degrees() / BIN_DEG).round() as i64).rem_euclid(TURN_BINS as i64) as usize
+        ((at.to_degrees() / BIN_DEG + 0.5).floor() as i64).rem_euclid(TURN_BINS as i64) as usize
+    }
+
+    /// Where in its bin a place lies, from 0 to 1.
+    #[inline]
+    pub(super) fn in_bin(self, at: f64) -> f64 {
+        (at.to_degrees() / BIN_DEG + 0.5).rem_euclid(1.0).min(1.0_f64.next_down())
+    }
+
+    /// Length of a bin along the seam.
+    pub(super) fn bin_mm(self) -> f64 {
+        self.along_mm(self.at_reading(BIN_DEG))
     }
 
     /// The bin so many beyond another; `None` beyond the end of a seam that has ends.
@@ -192,7 +203,7 @@ impl Course {
 
     /// How the height of a wall at a place grows with its offset, per mm in each of two directions.
     #[inline]
-    pub(super) fn offset(self, at: f64) -> [f64; 2] {
+    pub(in crate::weld) fn offset(self, at: f64) -> [f64; 2] {
         let (sin, cos) = at.sin_cos();
         [cos, sin]
     }

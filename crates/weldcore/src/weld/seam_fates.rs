@@ -10,10 +10,13 @@ use crate::fringes::Reason;
 use crate::ground::threads;
 use crate::ground::transform::Vec3;
 use crate::scanner::Lens;
+use crate::scanner::calibrated_region::OUTSIDE_CALIBRATION;
 
 /// The fates, in the order of `weldscan.result.FATES`: wall, transition, cap, gated, off line, dark, saturated, order in
 /// doubt, two paths, outside the calibration, hidden, other.
 pub const FATES: usize = 12;
+/// Which of them a pixel with a point has.
+const IS_POINT: [bool; FATES] = [true, true, true, true, true, false, false, false, false, false, false, true];
 /// Pixels this near to the weld count as its own: the surfaces beside the toes are read from them.
 const NEAR_MM: f64 = 8.0;
 
@@ -24,6 +27,9 @@ pub struct SeamFates {
     pub all: Vec<[u32; FATES]>,
     /// Those on the weld and within 8 mm of its toes.
     pub near: Vec<[u32; FATES]>,
+    /// The same without their fates, in cells of half a station along the seam, a whole number of them to a bin: pixels, and
+    /// those of them that have a point. A dark stretch may be shorter than a bin.
+    pub cells: Vec<[u32; 2]>,
 }
 
 fn of_fate(fate: u8) -> Option<usize> {
@@ -43,11 +49,12 @@ fn of_reason(reason: u8) -> usize {
         r if r == Reason::Saturated as u8 => 6,
         // Samples that are no sinusoid have no fringe order either.
         r if r == Reason::OrderInDoubt as u8 || r == Reason::NoFit as u8 => 7,
+        OUTSIDE_CALIBRATION => 9,
         _ => 5,
     }
 }
 
-/// Counts the pixels of a segmented shot; `reasons` as decoding gave them, `camera` with the shot's width and height.
+/// Counts the pixels of a segmented shot; `reasons` as decoding gave them, or [`OUTSIDE_CALIBRATION`], `camera` with the shot's width and height.
 ///
 /// # Errors
 /// [`Error::Shape`] where the arrays are not those of one image of the camera.
@@ -65,33 +72,48 @@ pub fn seam_fates(shot: &Segmentation, reasons: &[u8], camera: &Lens) -> Result<
     let reach = |i: usize| f64::from(shot.unrolled.across_mm[i]);
     let walls = (0..n).step_by(7).filter(|&i| shot.fates[i] == Fate::Wall as u8);
     let (low, high) = walls.map(reach).fold((f64::INFINITY, f64::NEG_INFINITY), |r, z| (r.0.min(z), r.1.max(z)));
-    let one = |i: usize| -> Option<(usize, usize, f64)> {
+    let cells_per_bin = (seam.course.bin_mm() / (0.5 * shot.sections.station_mm)).round().max(1.0);
+    let cell =
+        |at: f64| seam.course.bin(at) * cells_per_bin as usize + (seam.course.in_bin(at) * cells_per_bin) as usize;
+    let one = |i: usize| -> Option<(f64, usize, f64)> {
         if let Some(fate) = of_fate(shot.fates[i]) {
-            return Some((seam.course.bin(f64::from(shot.unrolled.at[i])), fate, reach(i)));
+            return Some((f64::from(shot.unrolled.at[i]), fate, reach(i)));
         }
         let (x, y) = camera.undistort((i % camera.width) as f64, (i / camera.width) as f64)?;
         let foot = seam.meet(&Vec3::new(x, y, 1.0))?;
         let [at, across, _] = seam.place(&foot.into());
-        (across > low && across < high).then(|| (seam.course.bin(at), of_reason(reasons[i]), across))
+        (across > low && across < high).then(|| (at, of_reason(reasons[i]), across))
+    };
+    let empty = || SeamFates {
+        all: vec![[0; FATES]; bins],
+        near: vec![[0; FATES]; bins],
+        cells: vec![[0; 2]; bins * cells_per_bin as usize],
     };
     let parts = threads::map_ranges(n, |range| {
-        let mut part = (vec![[0_u32; FATES]; bins], vec![[0_u32; FATES]; bins]);
-        for (bin, fate, across) in range.filter_map(one) {
-            part.0[bin][fate] += 1;
-            part.1[bin][fate] += u32::from(across.abs() < half);
+        let mut part = empty();
+        for (at, fate, across) in range.filter_map(one) {
+            let bin = seam.course.bin(at);
+            part.all[bin][fate] += 1;
+            if across.abs() < half {
+                part.near[bin][fate] += 1;
+                let [pixels, points] = &mut part.cells[cell(at)];
+                *pixels += 1;
+                *points += u32::from(IS_POINT[fate]);
+            }
         }
         part
     });
-    let mut found = SeamFates { all: vec![[0; FATES]; bins], near: vec![[0; FATES]; bins] };
-    for (all, near) in parts {
-        for k in 0..bins {
-            for f in 0..FATES {
-                found.all[k][f] += all[k][f];
-                found.near[k][f] += near[k][f];
-            }
-        }
+    let mut found = empty();
+    for part in parts {
+        add(&mut found.all, &part.all);
+        add(&mut found.near, &part.near);
+        add(&mut found.cells, &part.cells);
     }
     Ok(found)
+}
+
+fn add<const N: usize>(sum: &mut [[u32; N]], part: &[[u32; N]]) {
+    sum.as_flattened_mut().iter_mut().zip(part.as_flattened()).for_each(|(s, p)| *s += p);
 }
 
 #[cfg(test)]
@@ -104,12 +126,12 @@ mod tests {
     fn every_pixel_of_the_seam_is_counted_once() {
         let mut points = EXAMPLE.points();
         let mut reasons = vec![0_u8; points.len()];
-        // A band across the whole view is dark, another saturated.
-        for row in 100..120 {
+        // A band across the whole view is dark, another saturated, a third outside the calibration.
+        for row in 100..130 {
             for column in 0..COLUMNS {
                 let i = row * COLUMNS + column;
                 points[i] = [f64::NAN; 3];
-                reasons[i] = if row < 110 { Reason::Dark as u8 } else { Reason::Saturated as u8 };
+                reasons[i] = [Reason::Dark as u8, Reason::Saturated as u8, OUTSIDE_CALIBRATION][row / 10 - 10];
             }
         }
         let shot = segment(&points, COLUMNS, &EXAMPLE.nominal()).unwrap();
@@ -120,13 +142,23 @@ mod tests {
         let valid = points.iter().filter(|p| p[0].is_finite()).count() as u32;
         assert_eq!([0, 1, 2, 3, 4, 11].map(total).iter().sum::<u32>(), valid);
         // The rays of nearly all lost pixels meet the pipe.
-        for (fate, lost) in [(5, 10 * COLUMNS), (6, 10 * COLUMNS)] {
+        for (fate, lost) in [(5, 10 * COLUMNS), (6, 10 * COLUMNS), (9, 10 * COLUMNS)] {
             assert!(f64::from(total(fate)) > 0.9 * lost as f64, "{fate} {} {lost}", total(fate));
         }
         assert!(total(0) > 8 * valid / 10 && total(2) > 0 && total(3) == 0);
         for k in 0..found.all.len() {
             assert!(std::iter::zip(found.near[k], found.all[k]).all(|(near, all)| near <= all));
         }
+        // Cells tell the same as their bins, and which of them are dark.
+        let per_bin = found.cells.len() / found.near.len();
+        for (near, cells) in found.near.iter().zip(found.cells.chunks(per_bin)) {
+            assert_eq!(near.iter().sum::<u32>(), cells.iter().map(|c| c[0]).sum::<u32>());
+            let lost = (5..11).map(|f| near[f]).sum::<u32>();
+            assert_eq!(lost, cells.iter().map(|c| c[0] - c[1]).sum::<u32>());
+        }
+        let dark = found.cells.iter().filter(|c| c[0] > 50 && 20 * c[1] < c[0]).count();
+        // 20 rows of half a millimetre, in cells of two; where a dark pixel lies is known to about a row.
+        assert!((2..=6).contains(&dark), "{dark}");
         assert!(seam_fates(&shot, &reasons[1..], &camera).is_err());
     }
 }

@@ -43,7 +43,8 @@ const GATE_THICKNESSES: f64 = 2.0;
 const STRIP_HEIGHTS: f64 = 1.7;
 /// Points so many stations beyond the outermost ones, in the corners of a view, are held against those.
 const CORNER_STATIONS: f64 = 4.0;
-/// Segments one shot. `points` is a pixel grid `width` wide, row-major, NaN where there is no point.
+/// Segments one shot. `points` is a pixel grid `width` wide, row-major, NaN where there is no point; in one column or row
+/// they are a cloud, in any order.
 ///
 /// # Errors
 /// [`Error::Shape`], [`Error::OutOfRange`] on bad arguments; [`Error::TooFew`] where there is next to nothing;
@@ -388,6 +389,27 @@ pub(crate) mod tests {
         assert!(s.seam.across.dot(&Vec3::x()) > 0.999_99);
         // Angle 0 faces the scanner.
         assert!(s.seam.zero.dot(&Vec3::new(0.0, 0.0, -1.0)) > 0.999);
+    }
+
+    #[test]
+    fn bare_points_in_any_order_read_the_same() {
+        for (radius_mm, half_arc_rad) in [(54.0, 0.8), (315.0, 0.25)] {
+            let e = Example { radius_mm, half_arc_rad, ..EXAMPLE };
+            let grid = segment(&e.points(), COLUMNS, &e.nominal()).unwrap();
+            let seen: Vec<[f64; 3]> = e.points().into_iter().filter(|p| p[0].is_finite()).collect();
+            // In steps that share no factor with their number, every point comes once.
+            let n = seen.len();
+            let step = (n / 3..).find(|s| (2..=*s).all(|f| !(s.is_multiple_of(f) && n.is_multiple_of(f)))).unwrap();
+            let cloud: Vec<[f64; 3]> = (0..n).map(|i| seen[i * step % n]).collect();
+            let bare = segment(&cloud, 1, &e.nominal()).unwrap();
+            let count = |s: &Segmentation, l: Label| s.labels.iter().filter(|x| **x == l as u8).count() as f64;
+            for label in [Label::ReferenceWall, Label::OtherWall, Label::Bead] {
+                let (a, b) = (count(&grid, label), count(&bare, label));
+                assert!((a - b).abs() < 0.01 * a, "R {radius_mm} {label:?}: {a} {b}");
+            }
+            let middle = |s: &Segmentation| s.sections.stations[s.sections.stations.len() / 2].edge.unwrap().step_mm;
+            assert!((middle(&grid) - middle(&bare)).abs() < 0.02, "R {radius_mm}");
+        }
     }
 
     #[test]

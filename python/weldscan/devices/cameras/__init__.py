@@ -24,6 +24,8 @@ T = TypeVar("T")
 GRACE_S = 0.25
 """Beyond the deadline, so that a driver's own complaint is heard first."""
 CLOSE_S = 2.0
+BITS = (8, 10, 12, 14, 16)
+"""That a camera's numbers may have. Beyond 8 they come in words of 16."""
 EXPOSURE_TOLERANCE = 0.02
 """How far the exposure that was read back may be from the wanted one; cameras count lines or microseconds."""
 
@@ -48,6 +50,8 @@ class CameraSettings(BaseModel):
     """
     trigger_line: str = "Line1"
     """The camera's name of that input."""
+    bits: Literal[8, 10, 12, 14, 16] | None = None
+    """Of the camera's numbers; absent: as its pixel format says."""
     width: Annotated[int, Field(ge=1)] | None = None
     height: Annotated[int, Field(ge=1)] | None = None
     """The size that every frame must have; absent: that of the first frame."""
@@ -63,6 +67,8 @@ class Frame:
     """When it was there, on this computer's monotonic clock."""
     retries: int
     """Torn frames before it."""
+    full_scale: int
+    """The largest number that the camera can give: 4095 for 12 bits, though they come in words of 16."""
 
 
 class Camera(abc.ABC):
@@ -72,6 +78,12 @@ class Camera(abc.ABC):
     settings: CameraSettings
     name: str
     exposure_s: float = 0.0
+    streams: ClassVar[bool] = False
+    """Whether it exposes without being asked: see `next_frame`."""
+    _bits: int | None = None
+    """As the pixel format says."""
+    _used: int = 0
+    """The bits that were set in any frame so far."""
     _size: tuple[int, int] | None = None
     _thread: ThreadPoolExecutor | None = None
 
@@ -87,6 +99,10 @@ class Camera(abc.ABC):
     @abc.abstractmethod
     def _grab(self, deadline_s: float) -> NDArray[Any]:
         """Return one exposure that began after the call; `TornFrame` where parts of it are missing."""
+
+    def _next(self) -> NDArray[Any]:
+        """Return the next exposure as it comes, whenever it began; only where the camera streams."""
+        raise NotImplementedError
 
     @abc.abstractmethod
     def _close(self) -> None:
@@ -114,11 +130,31 @@ class Camera(abc.ABC):
         for attempt in range(self.settings.retries + 1):
             try:
                 image = self._checked(self._in_time(give_up_s, lambda: self._grab(give_up_s)))
-                return Frame(image, time.monotonic(), attempt)
+                return Frame(image, time.monotonic(), attempt, self.full_scale)
             except TornFrame as error:
                 if time.monotonic() > give_up_s:
                     raise DeviceTimeout(f"{self.name}: only torn frames, {attempt + 1} of them") from error
         raise DeviceError(f"{self.name}: {self.settings.retries + 1} torn frames in a row")
+
+    def next_frame(self) -> Frame:
+        """Return the next frame of a camera that streams: it may have begun long before the call."""
+        give_up_s = time.monotonic() + self.settings.timeout_s + self.exposure_s
+        image = self._checked(self._in_time(give_up_s, self._next))
+        return Frame(image, time.monotonic(), 0, self.full_scale)
+
+    @property
+    def full_scale(self) -> int:
+        """The largest number that the camera can give.
+
+        Where neither the configuration nor the pixel format says it: the narrowest of 8, 10, 12, 14 and 16 bits that
+        holds every number so far, after a shift by the low bits that are always zero.
+        """
+        if bits := self.settings.bits or self._bits:
+            return int(2**bits) - 1
+        shift = (self._used & -self._used).bit_length() - 1 if self._used else 0
+        used = self._used.bit_length() - shift
+        full = int(2 ** next(bits for bits in BITS if used <= bits)) - 1
+        return min(full << shift, int(2 ** BITS[-1]) - 1)
 
     def _in_time(self, deadline_s: float, call: Callable[[], T]) -> T:
         """Let a thread of the camera's own do it: a driver that is deaf to everything does not hold us up."""
@@ -144,6 +180,15 @@ class Camera(abc.ABC):
         if size != wanted:
             raise DeviceError(f"{self.name}: a frame of {size[0]}x{size[1]}, not {wanted[0]}x{wanted[1]} pixels")
         self._size = size
+        if image.dtype == np.uint8:
+            self._bits = BITS[0]
+        else:
+            self._used |= int(np.bitwise_or.reduce(image, axis=None))
+        if image.max() > self.full_scale:
+            raise DeviceError(
+                f"{self.name}: a frame holds {image.max()}, beyond the full scale of {self.full_scale}: correct "
+                "camera.bits or camera.pixel_format"
+            )
         return image
 
     def __enter__(self) -> Self:

@@ -26,7 +26,7 @@ class AravisSettings(CameraSettings):
     backend: Literal["aravis"] = "aravis"
     device: str | None = None
     """Name or address as `weldscan camera list` shows it; absent: the first one."""
-    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono8"
+    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono14", "Mono16"] = "Mono8"
     gain: float | None = None
     packet_size: int | None = None
     """Bytes; absent: as large as the network takes."""
@@ -54,6 +54,7 @@ class AravisCamera(Camera):
     def __init__(self, settings: AravisSettings) -> None:
         self.settings = settings
         self.name = f"camera {settings.device or 'aravis'}"
+        self._bits = int(settings.pixel_format.removeprefix("Mono"))
         self._aravis, self._glib = _library()
         with self._errors("open"):
             self._camera = self._aravis.Camera.new(settings.device)

@@ -1,8 +1,8 @@
 """Cameras behind OpenCV: V4L2 and UVC.
 
-Such a camera streams whether asked or not, and keeps frames in a queue: after each question the queue is emptied, and
-the first frame counts that was exposed after it. Automatic exposure, gain and white balance are switched off and read
-back.
+Such a camera streams whether asked or not, keeps frames in a queue, and takes its time to bring them over USB. What
+began before the question is over and here after its exposure and its way (`transfer_s`); of that the queue holds some,
+and the first frame behind those counts. Automatic exposure, gain and white balance are switched off and read back.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ class OpenCvSettings(CameraSettings):
     gain: float | None = None
     queue: Annotated[int, Field(ge=0, le=64)] = 4
     """Frames that the driver may hold; V4L2 takes 4 buffers unless told otherwise."""
+    transfer_s: Annotated[float, Field(ge=0, le=10)] = 0.1
+    """From the end of an exposure until its frame is here, at most; `weldscan devices check` measures it."""
 
 
 class OpenCvCamera(Camera):
@@ -40,6 +42,7 @@ class OpenCvCamera(Camera):
 
     Settings = OpenCvSettings
     settings: OpenCvSettings
+    streams = True
 
     def __init__(self, settings: OpenCvSettings) -> None:
         self.settings = settings
@@ -83,16 +86,19 @@ class OpenCvCamera(Camera):
         return float(self._capture.get(cv2.CAP_PROP_EXPOSURE)) * V4L2_UNIT_S
 
     def _grab(self, deadline_s: float) -> NDArray[Any]:
-        asked_s = time.monotonic()
-        for _ in range(self.settings.queue + 2):
-            if not self._capture.grab():  # which waits for 10 s, whatever the deadline: see `Camera._in_time`
-                raise DeviceError(f"{self.name}: no frame: is it unplugged?")
-            now_s = time.monotonic()
-            if now_s > deadline_s:
+        time.sleep(self.exposure_s + self.settings.transfer_s)
+        for _ in range(self.settings.queue):
+            self._advance()
+            if time.monotonic() > deadline_s:
                 raise DeviceTimeout(f"{self.name}: no frame in time")
-            # A frame that had to be waited for is not from the queue; it began after the question if it took that long.
-            if now_s - asked_s > 2 * self.exposure_s:
-                break
+        return self._next()
+
+    def _advance(self) -> None:
+        if not self._capture.grab():  # which waits for 10 s, whatever the deadline: see `Camera._in_time`
+            raise DeviceError(f"{self.name}: no frame: is it unplugged?")
+
+    def _next(self) -> NDArray[Any]:
+        self._advance()
         whole, image = self._capture.retrieve()
         if not whole or image is None:
             raise DeviceError(f"{self.name}: a frame that cannot be decoded")

@@ -19,7 +19,7 @@ class PylonSettings(CameraSettings):
     backend: Literal["pylon"] = "pylon"
     serial_number: str | None = None
     """Absent: the first camera."""
-    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono8"
+    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono14", "Mono16"] = "Mono8"
     features: dict[str, bool | int | float | str] = Field(default_factory=dict)
     """Further GenICam features to set, in this order, each read back."""
 
@@ -43,6 +43,7 @@ class PylonCamera(Camera):
     def __init__(self, settings: PylonSettings) -> None:
         self.settings = settings
         self.name = f"camera {settings.serial_number or 'pylon'}"
+        self._bits = int(settings.pixel_format.removeprefix("Mono"))
         self._pylon, self._genicam = _library()
         pylon = self._pylon
         try:

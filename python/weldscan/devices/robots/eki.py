@@ -3,11 +3,13 @@
 There is no length and no terminator: a message ends with the closing tag of its root. On the controller every element
 has its own FIFO, so both sides always send every element. Configuration and program: `krl/WeldscanEki.xml`,
 `krl/weldscan_eki.src`.
+
+There is no checksum either, so the program tells every number of the reading a second time with the other sign: a digit
+that got lost, got in or got changed on its way is in one of the two.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -18,14 +20,12 @@ from xml.etree import ElementTree
 from pydantic import Field
 
 from weldscan.devices.robots import RobotSettings
-from weldscan.devices.robots.program import LAST_NUMBER, ProgramRobot
-from weldscan.devices.robots.wire import LARGEST_MESSAGE, Host, TcpTransport, cut_xml, parse_xml
+from weldscan.devices.robots.program import LAST_NUMBER, Command, ProgramRobot
+from weldscan.devices.robots.wire import LARGEST_MESSAGE, Host, TcpTransport, cut_xml, only, parse_xml, xml_text
 from weldscan.errors import DeviceError, InputError
-from weldscan.pose import KukaPose
+from weldscan.pose import KukaPose, parse_number, parse_whole
 from weldscan.records.files import read_bytes
 
-POSE, MOVE = 1, 2
-"""Commands of our program."""
 CARTESIAN = ("X", "Y", "Z", "A", "B", "C")
 JOINTS = ("A1", "A2", "A3", "A4", "A5", "A6")
 STREAM_S = 0.012
@@ -71,10 +71,14 @@ class EkiConfig:
     def read(cls, path: Path) -> EkiConfig:
         """Read a configuration file, which may have comments but no DTD."""
         text = read_bytes(path, LARGEST_MESSAGE)
-        if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
+        try:
+            document = xml_text(text)
+        except DeviceError as error:
+            raise InputError(f"{path}: {error}") from error
+        if "<!DOCTYPE" in document or "<!ENTITY" in document:
             raise InputError(f"{path}: XML with a DTD is refused")
         try:
-            root = ElementTree.fromstring(text)
+            root = ElementTree.fromstring(document)
             elements = {
                 side: tuple(
                     Element.parse(item.attrib["Tag"], item.get("Type", "REAL"))
@@ -107,14 +111,16 @@ OURS = EkiConfig(
         *(Element.parse(f"Sensor/Target/@{name}") for name in CARTESIAN),
     ),
     send=(
-        Element.parse("Robot/Reply/@Id"),
-        Element.parse("Robot/Reply/@Status"),
-        Element.parse("Robot/Reply/@Mode"),
-        Element.parse("Robot/Reply/@Interpolation"),
+        *(Element.parse(f"Robot/Reply/@{name}") for name in ("Id", "Status", "Mode", "Interpolation")),
         *(Element.parse(f"Robot/{frame}/@{name}") for frame in ("Position", "Tool", "Base") for name in CARTESIAN),
         *(Element.parse(f"Robot/Axis/@{name}") for name in JOINTS),
+        *(Element.parse(f"Robot/Target/@{name}") for name in CARTESIAN),
+        *(Element.parse(f"Robot/Minus{frame}/@{name}") for frame in ("Position", "Tool", "Base") for name in CARTESIAN),
+        *(Element.parse(f"Robot/MinusAxis/@{name}") for name in JOINTS),
     ),
 )
+TOLD_TWICE = 4 * 6
+"""The last numbers of a reply, which tell $POS_ACT, $TOOL, $BASE and the joints once more."""
 
 
 def compose(elements: tuple[Element, ...], values: dict[Element, str]) -> bytes:
@@ -137,18 +143,16 @@ def dissect(elements: tuple[Element, ...], message: bytes) -> dict[Element, str]
     root = parse_xml(message, elements[0].path[0])
     values = {}
     for element in elements:
-        node = root if len(element.path) == 1 else root.find("/".join(element.path[1:]))
+        node = root if len(element.path) == 1 else only(root, "/".join(element.path[1:]))
         text = None if node is None else node.text if element.attribute is None else node.get(element.attribute)
         where = "/".join((*element.path, *([f"@{element.attribute}"] if element.attribute else [])))
         if text is None or not text.strip():
             raise DeviceError(f"{where} is {'missing' if text is None else 'empty'}")
         if element.type in ("REAL", "INT"):
             try:
-                number = float(text) if element.type == "REAL" else int(text)
-            except ValueError as error:
-                raise DeviceError(f"{where}: {text[:40]!r} is not a number") from error
-            if not math.isfinite(number):
-                raise DeviceError(f"{where} is {number}")
+                (parse_number if element.type == "REAL" else parse_whole)(text.strip())
+            except InputError as error:
+                raise DeviceError(f"{where}: {error}") from None
         values[element] = text.strip()
     return values
 
@@ -168,11 +172,14 @@ class EkiRobot(ProgramRobot):
             settings, f"EKI {host}:{port}", partial(TcpTransport.connect, host, port), cut_xml, LAST_NUMBER
         )
 
-    def _request(self, number: int, target: KukaPose | None) -> bytes:
-        values = [number, MOVE if target else POSE, *(target.values() if target else [0.0] * 6)]
+    def _request(self, number: int, command: Command, target: KukaPose) -> bytes:
+        values = [number, int(command), *target.values()]
         return compose(OURS.receive, dict(zip(OURS.receive, map(str, values), strict=True)))
 
     def _reply(self, message: bytes) -> tuple[int, Sequence[float]]:
         texts = dissect(OURS.send, message)
-        number, *values = (float(texts[element]) for element in OURS.send)
-        return int(number), values
+        number, *codes = (parse_whole(texts[element]) for element in OURS.send[:4])
+        values = [parse_number(texts[element]) for element in OURS.send[4:]]
+        if any(a != -b for a, b in zip(values[:TOLD_TWICE], values[-TOLD_TWICE:], strict=True)):
+            raise DeviceError("the reading is not what it is when told a second time")
+        return number, [*codes, *values[:-TOLD_TWICE]]

@@ -2,25 +2,34 @@
 
 A request is `u16 id, u16 length, u8 function, u16 n, name[, u16 m, value]`, a reply `u16 id, u16 length, u8 function,
 u16 n, value, u16 error, u8 ok`, big-endian, the length counting what follows it. Functions 0 and 1 read and write in
-ASCII; C3 Bridge alone knows 4 to 7, with text in UTF-16LE and several variables at once. Motion goes through
-`krl/weldscan_kvp.src`.
+ASCII; C3 Bridge alone knows 4 to 7, with text in UTF-16LE and several variables at once.
+
+Motion goes through `krl/weldscan_kvp.src`, in two steps, for a variable keeps its value whoever wrote it and died.
+COM_TARGET, then COM_ACTION = a number: the program copies the target to COM_GOAL, looks whether the arm can go there,
+and says COM_TAKEN = the number. COM_GO = the number sets off, as long as $TIMER[16] is below zero: that is the lease,
+two seconds by the controller's own clock, which the client renews while it lives. COM_DONE = the number and COM_STATUS
+tell the end. When the lease ends the program brakes and drops the request; a program that starts drops what it finds.
 """
 
 from __future__ import annotations
 
+import contextlib
+import secrets
 import struct
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from weldscan.devices.robots import POLL_S, Reading, RobotSettings, StreamRobot, distance
-from weldscan.devices.robots.wire import Host, TcpTransport
+from weldscan.devices.robots import POLL_S, RESPITE_S, SINGLE_DEG, SINGLE_MM, Reading, RobotSettings, StreamRobot
+from weldscan.devices.robots.plausible import distance
+from weldscan.devices.robots.program import Status
+from weldscan.devices.robots.wire import Deadline, Host, TcpTransport
 from weldscan.errors import DeviceError, DeviceTimeout, InputError
-from weldscan.pose import KukaPose, format_frame, parse_e6axis, parse_e6pos, parse_frame
+from weldscan.pose import KukaPose, format_frame, parse_e6axis, parse_e6pos, parse_frame, parse_whole
 
 READ, WRITE, READ_UNICODE, WRITE_UNICODE, READ_MANY, WRITE_MANY = 0, 1, 4, 5, 6, 7
 LAST_NUMBER = 65_535
@@ -30,8 +39,9 @@ HEARTBEAT_S = 20.0
 DONE, REFUSED = b"\x00\x01\x01", b"\x00\x00\x00"
 """How a reply ends: a 16-bit field that the published samples fill with 1 and 0, and the byte that tells success."""
 PROGRAM = "WELDSCAN_KVP"
-SINGLE_MM, SINGLE_DEG = 0.002, 1e-3
-"""A controller keeps REAL in single precision: 0.0005 mm at 10 m, and less than 1e-4 degrees."""
+LEASE = "$TIMER[16]"
+"""Counts up in ms; the program drives only below zero."""
+LAST_REQUEST = 2**30
 FRAME_NAMES = ("$TOOL", "$BASE", "$IPO_MODE", "$MODE_OP")
 
 
@@ -161,30 +171,38 @@ class KvpRobot(StreamRobot):
         super().__init__(
             settings, f"KVP {host}:{port}", partial(TcpTransport.connect, host, port), cut_frame, LAST_NUMBER
         )
+        self._request: int | None = None
         self._closed = threading.Event()
         threading.Thread(target=self._heartbeat, daemon=True).start()
 
-    def get(self, *names: str) -> list[str]:
+    def get(self, *names: str, deadline: Deadline | None = None) -> list[str]:
         """Return the values of variables, as the controller prints them."""
+        deadline = deadline or self._link.deadline()
         if self.settings.dialect == "c3":
-            return self._ask(READ_MANY, names, len(names))
-        return [self._ask(READ, [name], 1)[0] for name in names]
+            return self._ask(READ_MANY, names, len(names), deadline)
+        return [self._ask(READ, [name], 1, deadline)[0] for name in names]
 
-    def set(self, name: str, value: str) -> None:
+    def set(self, name: str, value: str, deadline: Deadline | None = None) -> None:
         """Write a variable. Never repeated: a write may have happened although its reply was lost."""
-        self._ask(WRITE, [name, value], 1, repeat=False)
+        self._ask(WRITE, [name, value], 1, deadline or self._link.deadline(), repeat=False)
 
-    def read(self) -> Reading:
-        """Read $POS_ACT between two readings of the frames: a change between them cannot make a wrong pose."""
+    def read(self, deadline: Deadline | None = None) -> Reading:
+        """Read $POS_ACT between two readings of the frames: a change between them cannot make a wrong pose. All of it
+        within `timeout_s`, or it is read anew: a position is of the frames of its own moment, not of those before a
+        lost connection.
+        """
+        deadline = deadline or self._link.deadline()
         for _ in range(3):
-            before = self.get(*FRAME_NAMES)
+            begun_s = time.monotonic()
+            before = self.get(*FRAME_NAMES, deadline=deadline)
             asked_s = time.monotonic()
-            (position,) = self.get("$POS_ACT")
+            (position,) = self.get("$POS_ACT", deadline=deadline)
             told_s = time.monotonic()
-            if self.get(*FRAME_NAMES) == before:
+            after = self.get(*FRAME_NAMES, deadline=deadline)
+            if after == before and time.monotonic() - begun_s <= self.settings.timeout_s:
                 break
         else:
-            raise DeviceError(f"{self.name}: tool, base or mode keep changing")
+            raise DeviceError(f"{self.name}: tool, base or mode keep changing, or the answers are too slow")
         tool, base, interpolation, mode = before
         try:
             return Reading(
@@ -211,30 +229,73 @@ class KvpRobot(StreamRobot):
         super().close()
 
     def _move(self, target: KukaPose, give_up_s: float) -> None:
-        """Target first, trigger last; then wait until the program has done it."""
+        """Target first, then the request's number; look how the program took it; then the lease, and go."""
         self._check_program()
-        self._wait_until_idle(give_up_s)  # it may still be at what a scan wanted that was killed
+        self._wait_until(lambda: self._whole("COM_ACTION") == 0, give_up_s, "another request is not finished")
+        self._request = request = secrets.randbelow(LAST_REQUEST) + 1
         self.set("COM_TARGET", format_frame(target))
-        (text,) = self.get("COM_TARGET")
+        self.set("COM_ACTION", str(request))
+        taken_s = min(time.monotonic() + RESPITE_S, give_up_s)
+        self._wait_until(lambda: self._taken(request), taken_s, "the program did not take the target")
+        (text,) = self.get("COM_GOAL")
         try:
             off_mm, off_deg = distance(parse_frame(text), target)
         except InputError as error:
-            raise DeviceError(f"{self.name}: COM_TARGET: {error}") from error
+            raise DeviceError(f"{self.name}: COM_GOAL: {error}") from error
         if off_mm > SINGLE_MM or off_deg > SINGLE_DEG:
             raise DeviceError(f"{self.name}: the controller took another target: {text}")
-        self.set("COM_ACTION", "1")
-        self._wait_until_idle(give_up_s)
+        self._lease()
+        self.set("COM_GO", str(request))
+        self._wait_until(
+            lambda: self._whole("COM_DONE") == request, give_up_s, "the program did not finish the motion", self._lease
+        )
+        self._check_status()
 
-    def _wait_until_idle(self, give_up_s: float) -> None:
-        while self.get("COM_ACTION")[0].strip() != "0":
+    def _taken(self, request: int) -> bool:
+        if self._whole("COM_DONE") == request:  # so soon only without having moved
+            self._check_status()
+        return self._whole("COM_TAKEN") == request
+
+    def _lease(self) -> None:
+        """Say that the motion is still wanted, for two seconds more."""
+        self.set(LEASE, str(round(-1000 * RESPITE_S)))
+
+    def _check_status(self) -> None:
+        status = self._whole("COM_STATUS")
+        if status != Status.DONE:
+            said = Status(status).name.lower().replace("_", " ") if status in list(Status) else f"status {status}"
+            raise DeviceError(f"{self.name}: not moved: {said}")
+
+    def _whole(self, name: str) -> int:
+        try:
+            return parse_whole(self.get(name)[0].strip())
+        except InputError as error:
+            raise DeviceError(f"{self.name}: {name}: {error}") from error
+
+    def _wait_until(
+        self, done: Callable[[], bool], give_up_s: float, complaint: str, meanwhile: Callable[[], None] = lambda: None
+    ) -> None:
+        while not done():
             self._check_program()
             if time.monotonic() > give_up_s:
-                self.set("COM_ACTION", "0")  # what has not begun shall not begin when nobody expects it
-                raise DeviceTimeout(f"{self.name}: the program did not finish the motion")
+                raise DeviceTimeout(f"{self.name}: {complaint}")
+            meanwhile()
             time.sleep(POLL_S)
 
+    def _withdraw(self, deadline: Deadline) -> str:
+        """End the lease, on which the program brakes, and take the request back; over a new connection."""
+        self._link.renew()
+        said = "no motion is waiting"
+        for _ in range(3):  # what was on its way over the old connection may land after the first
+            if self._request is not None and self.get("COM_ACTION", deadline=deadline) == [str(self._request)]:
+                for name in (LEASE, "COM_GO", "COM_ACTION"):
+                    self.set(name, "0", deadline)
+                said = "the motion is withdrawn"
+            time.sleep(POLL_S)
+        return said
+
     def _check_program(self) -> None:
-        """COM_ACTION means something only while our program runs, in T1."""
+        """What the program says means something only while it runs, in T1."""
         program, state, mode = (
             value.strip('" ').upper() for value in self.get("$PRO_NAME1[]", "$PRO_STATE1", "$MODE_OP")
         )
@@ -243,15 +304,17 @@ class KvpRobot(StreamRobot):
         if mode != "#T1":
             raise DeviceError(f"{self.name}: motion only in T1, the controller says {mode}")
 
-    def _ask(self, function: int, texts: Sequence[str], count: int, repeat: bool = True) -> list[str]:
+    def _ask(
+        self, function: int, texts: Sequence[str], count: int, deadline: Deadline, repeat: bool = True
+    ) -> list[str]:
         number = self._next_number()
         request = encode_request(number, function, texts)
-        return self._link.ask(request, lambda frame: decode_reply(frame, number, function, count), repeat)
+        return self._link.ask(
+            request, lambda frame: decode_reply(frame, number, function, count), repeat, deadline
+        ).value
 
     def _heartbeat(self) -> None:
         while not self._closed.wait(HEARTBEAT_S / 4):
             if time.monotonic() - self._link.last_used_s > HEARTBEAT_S:
-                try:
+                with contextlib.suppress(DeviceError):  # the next question says so to someone who can act on it
                     self.get("$MODE_OP")
-                except DeviceError:
-                    continue  # the next question says so to someone who can act on it

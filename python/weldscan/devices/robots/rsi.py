@@ -1,12 +1,13 @@
 """RSI: the controller sends its pose as XML over UDP every 4 or 12 ms, and stops when it gets no answer in time.
 
 Used here to read poses only: every answer carries zero corrections and echoes IPOC, digit by digit. A process of its
-own (`rsi_answer.py`) answers before anyone looks. With ONLYSEND = TRUE in the configuration the controller wants no
-answer, which is the better choice for a measuring cell: `krl/WeldscanRsi.xml`.
+own (`rsi_answer.py`) answers before anyone looks, and says which packets are in order. With ONLYSEND = TRUE in the
+configuration the controller wants no answer, which is the better choice for a measuring cell: `krl/WeldscanRsi.xml`.
 """
 
 from __future__ import annotations
 
+import logging
 import socket
 import subprocess
 import sys
@@ -17,14 +18,17 @@ from xml.etree import ElementTree
 
 from pydantic import Field
 
-from weldscan.devices.robots import Reading, Robot, RobotSettings, rsi_answer
-from weldscan.devices.robots.rsi_answer import IPOC, LARGEST_PACKET, REPORT
-from weldscan.devices.robots.wire import Host, parse_xml
+from weldscan.devices.robots import Reading, Robot, RobotSettings, Six, rsi_answer
+from weldscan.devices.robots.rsi_answer import LARGEST_PACKET, REPORT
+from weldscan.devices.robots.wire import Deadline, Host, only, parse_xml
 from weldscan.errors import DeviceError, DeviceTimeout, InputError
-from weldscan.pose import KukaPose
+from weldscan.pose import KukaPose, parse_number
 
 CARTESIAN = ("X", "Y", "Z", "A", "B", "C")
 JOINTS = ("A1", "A2", "A3", "A4", "A5", "A6")
+START_S = 10.0
+"""For the process that answers to start, on a machine that has other things to do."""
+log = logging.getLogger(__name__)
 
 
 class RsiSettings(RobotSettings):
@@ -39,9 +43,9 @@ class RsiSettings(RobotSettings):
     sen_type: Annotated[str, Field(pattern=r"^\w{1,32}$")] = "ImFree"
     only_send: bool = False
     """ONLYSEND = TRUE in the controller's configuration: nothing is answered."""
-    tool: tuple[float, float, float, float, float, float] = (0.0,) * 6
+    tool: Six = (0.0,) * 6
     """$TOOL while RSI runs, X Y Z A B C: the stream does not tell it. Our KRL program sets $NULLFRAME."""
-    base: tuple[float, float, float, float, float, float] = (0.0,) * 6
+    base: Six = (0.0,) * 6
     """$BASE while RSI runs."""
 
 
@@ -55,8 +59,9 @@ class RsiRobot(Robot):
     def __init__(self, settings: RsiSettings) -> None:
         self.settings = settings
         self.name = f"RSI {settings.host}:{settings.port}"
-        self.packets = self.answered = self.unusable = self.repeated = 0
-        self._ipoc = -1
+        self.packets = self.answered = self.unusable = self.stale = self.strangers = self.restarts = self.held = 0
+        """What came, was answered, was no packet, was out of order, was of others; how often the stream began anew;
+        what had lain in the socket."""
         self._lock = threading.Lock()
         self._reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._reports.bind(("127.0.0.1", 0))
@@ -68,20 +73,23 @@ class RsiRobot(Robot):
             process_group=0,  # Ctrl-C is for the scan, also while this one starts
             text=True,
         )
+        hangs = threading.Timer(START_S, self._process.kill)
+        hangs.start()
         said = self._process.stdout.readline().split(maxsplit=2)  # type: ignore[union-attr]
+        hangs.cancel()
         if said[:1] != ["ok"]:
             self.close()
             raise DeviceError(f"{self.name}: cannot listen: {' '.join(said)}")
         self.port = int(said[1])
         self._reporter = ("127.0.0.1", int(said[2]))
 
-    def read(self) -> Reading:
+    def read(self, deadline: Deadline | None = None) -> Reading:
         """Wait for the next packet of the stream: what came before the question is not an answer to it."""
-        asked_s = time.monotonic()
+        deadline = deadline or Deadline(self.settings.timeout_s)
         with self._lock:
             while True:
-                time_s, packet = self._report(asked_s + self.settings.timeout_s)
-                if time_s > asked_s:
+                time_s, packet = self._report(deadline)
+                if time_s > deadline.start_s:
                     break
         try:
             return self._reading(packet, time_s)
@@ -99,38 +107,36 @@ class RsiRobot(Robot):
         self._process.stdout.close()  # type: ignore[union-attr]
         self._reports.close()
 
-    def _report(self, deadline_s: float) -> tuple[float, bytes]:
-        """Return the next usable packet that tells something new, and when it came."""
+    def _report(self, deadline: Deadline) -> tuple[float, bytes]:
+        """Return the next packet that is in order, and when it came."""
         while True:
-            self._reports.settimeout(max(deadline_s - time.monotonic(), 1e-4))
+            self._reports.settimeout(max(deadline.end_s - time.monotonic(), 1e-4))
             try:
                 report, peer = self._reports.recvfrom(LARGEST_PACKET)
             except TimeoutError:
                 raise DeviceTimeout(
-                    f"{self.name}: no new pose within {self.settings.timeout_s:g} s "
-                    f"({self.packets} packets so far, {self.unusable} unusable, {self.repeated} repeated)"
+                    f"{self.name}: no new pose within {deadline.timeout_s:g} s ({self.packets} packets so far, "
+                    f"{self.unusable} unusable, {self.stale} out of order, {self.strangers} of other senders)"
                 ) from None
             if peer != self._reporter or len(report) < REPORT.size:
                 continue
-            time_s, self.packets, self.answered, self.unusable = REPORT.unpack_from(report)
+            restarts = self.restarts
+            time_s, self.packets, self.answered, self.unusable, *order = REPORT.unpack_from(report)
+            self.stale, self.strangers, self.restarts, self.held = order
+            if self.restarts > restarts:
+                log.warning("%s: the controller's stream was silent and began anew", self.name)
             packet = report[REPORT.size :]
-            ipoc = IPOC.search(packet)
-            if ipoc is None:
-                continue
-            if int(ipoc[1]) == self._ipoc:
-                self.repeated += 1  # a stream that stands still tells nothing new
-                continue
-            self._ipoc = int(ipoc[1])
-            return time_s, packet
+            if packet:
+                return time_s, packet
 
     def _reading(self, packet: bytes, time_s: float) -> Reading:
         root = parse_xml(packet, "Rob")
         kind = root.get("Type", root.get("TYPE"))
         if kind != "KUKA":
             raise DeviceError(f"a packet of type {kind}, expected KUKA")
-        joints = root.find("AIPos")
+        joints = only(root, "AIPos")
         return Reading(
-            position=KukaPose(*_numbers(root.find("RIst"), "RIst", CARTESIAN)),
+            position=KukaPose(*_numbers(only(root, "RIst"), "RIst", CARTESIAN)),
             tool=KukaPose(*self.settings.tool),
             base=KukaPose(*self.settings.base),
             interpolation="#BASE",
@@ -144,6 +150,6 @@ def _numbers(element: ElementTree.Element | None, name: str, keys: tuple[str, ..
     if element is None:
         raise DeviceError(f"the packet has no {name}: add DEF_{name} to the RSI configuration")
     try:
-        return [float(element.get(key, "missing")) for key in keys]
-    except ValueError as error:
-        raise DeviceError(f"{name}: {error}") from error
+        return [parse_number(element.get(key, "missing")) for key in keys]
+    except InputError as error:
+        raise DeviceError(f"{name}: {error}") from None

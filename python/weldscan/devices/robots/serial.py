@@ -1,9 +1,10 @@
 r"""A serial line through pyserial: a device, `socket://host:port` or `loop://`; a KRL program of ours with CREAD and
 CWRITE.
 
-One request, one reply, each a line `<id> <words>*<checksum>\r\n` in ASCII. The checksum is Fletcher's with 16 bits, in
-decimal digits, over everything before the star: KRL can add and divide integers, and so can compute it; unlike an XOR
-it sees two bytes that changed places. Program: `krl/weldscan_serial.src`.
+One request, one reply, each a line `<id>,<number>,...*<checksum>\r\n` in ASCII, without a blank, at which a controller
+may end what it reads. The checksum is Fletcher's with 16 bits, in decimal digits, over everything before the star: KRL
+can add and divide integers, and so can compute it; unlike an XOR it sees two bytes that changed places. Program:
+`krl/weldscan_serial.src`.
 """
 
 from __future__ import annotations
@@ -12,15 +13,16 @@ import os
 import time
 from collections.abc import Sequence
 from typing import Annotated, Literal
+from urllib.parse import urlsplit
 
 import serial
 from pydantic import Field
 
 from weldscan.devices.robots import RobotSettings
-from weldscan.devices.robots.program import LAST_NUMBER, REPLY_NUMBERS, ProgramRobot
-from weldscan.devices.robots.wire import ConnectionLost
-from weldscan.errors import DeviceError, DeviceTimeout
-from weldscan.pose import KukaPose
+from weldscan.devices.robots.program import LAST_NUMBER, REPLY_NUMBERS, Command, ProgramRobot
+from weldscan.devices.robots.wire import ConnectionLost, TcpTransport, Transport
+from weldscan.errors import DeviceError, DeviceTimeout, InputError
+from weldscan.pose import KukaPose, parse_number, parse_whole
 
 LONGEST_LINE = 1024
 
@@ -52,21 +54,26 @@ def checksum(data: bytes) -> int:
     return high * 256 + low
 
 
-def encode_line(number: int, words: str) -> bytes:
-    """Return one line."""
-    text = f"{number} {words}".encode("ascii")
+def encode_line(number: int, values: Sequence[float]) -> bytes:
+    r"""Return one line; whole numbers are written as such, others with six decimals.
+
+    >>> encode_line(7, [1, 0.5])
+    b'7,1,0.500000*52293\r\n'
+    """
+    text = ",".join(str(value) if isinstance(value, int) else f"{value:.6f}" for value in (number, *values)).encode()
     return text + b"*%d\r\n" % checksum(text)
 
 
 def decode_line(line: bytes) -> tuple[int, list[str]]:
-    """Return the id and the words of a line whose checksum is right."""
+    """Return the id and the numbers, as text, of a line whose checksum is right."""
     text, star, digits = line.rstrip(b"\r\n").rpartition(b"*")
-    if not star or not digits.isdigit() or int(digits) != checksum(text):
+    if not star or not digits.isdigit() or len(digits) > 5 or int(digits) != checksum(text):
         raise DeviceError(f"a line with a wrong checksum: {line[:40]!r}")
-    number, *words = text.decode("ascii", "replace").split()
-    if not number.isdigit():
-        raise DeviceError(f"a line without a number: {line[:40]!r}")
-    return int(number), words
+    number, *values = text.decode("ascii", "replace").split(",")
+    try:
+        return parse_whole(number), values
+    except InputError:
+        raise DeviceError(f"a line without a number: {line[:40]!r}") from None
 
 
 def cut_line(buffer: bytearray) -> bytes | None:
@@ -118,10 +125,23 @@ class SerialTransport:
 
     def close(self) -> None:
         """Close it."""
-        peer = getattr(self._port, "_socket", None)
         self._port.close()
-        if peer is not None:  # of socket://: pyserial leaves it open where the other side has closed it
-            peer.close()
+
+
+def connect(port: str, baud: int, deadline_s: float) -> Transport:
+    """Open a port. `socket://host:port` is TCP and nothing else; pyserial would wait 5 s for it, whatever it may."""
+    if not port.lower().startswith("socket://"):
+        return SerialTransport(port, baud)
+    try:
+        host, number = urlsplit(port).hostname, urlsplit(port).port
+    except ValueError as error:
+        raise ConnectionLost(f"cannot open: {error}") from error
+    if not host or number is None:
+        raise ConnectionLost("cannot open: should be socket://host:port")
+    try:
+        return TcpTransport.connect(host, number, deadline_s)
+    except ConnectionLost as error:
+        raise ConnectionLost(f"cannot open: {error}") from error
 
 
 # --- the client -------------------------------------------------------------------------------------------------------
@@ -137,20 +157,16 @@ class SerialRobot(ProgramRobot):
         super().__init__(
             settings,
             f"serial {settings.port}",
-            lambda _deadline_s: SerialTransport(settings.port, settings.baud),
+            lambda deadline_s: connect(settings.port, settings.baud, deadline_s),
             cut_line,
             LAST_NUMBER,
         )
 
-    def _request(self, number: int, target: KukaPose | None) -> bytes:
-        words = "POSE" if target is None else "MOVE " + " ".join(f"{value:.6f}" for value in target.values())
-        return encode_line(number, words)
+    def _request(self, number: int, command: Command, target: KukaPose) -> bytes:
+        return encode_line(number, [int(command), *target.values()])
 
     def _reply(self, message: bytes) -> tuple[int, Sequence[float]]:
         number, texts = decode_line(message)
         if len(texts) != REPLY_NUMBERS:
             raise DeviceError(f"{len(texts)} numbers for {REPLY_NUMBERS}")
-        try:
-            return number, [*map(int, texts[:3]), *map(float, texts[3:])]
-        except ValueError as error:
-            raise DeviceError(f"not a number: {error}") from error
+        return number, [*map(parse_whole, texts[:3]), *map(parse_number, texts[3:])]

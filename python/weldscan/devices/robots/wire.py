@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import queue
 import re
 import select
 import socket
@@ -16,7 +17,8 @@ import struct
 import threading
 import time
 from collections.abc import Callable
-from typing import Annotated, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Annotated, Any, Generic, Protocol, TypeVar
 from xml.etree import ElementTree
 
 from pydantic import AfterValidator
@@ -29,6 +31,8 @@ Cut = Callable[[bytearray], bytes | None]
 
 LARGEST_MESSAGE = 65_536
 """Bytes: the largest message of any link here has about 1,000."""
+BEAT_S = 0.5
+"""Whoever waits for a motion says so this often."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
 """Back-off between attempts to reconnect: doubled from the first to the longest."""
 
@@ -45,6 +49,31 @@ def checked_host(host: str) -> str:
 
 
 Host = Annotated[str, AfterValidator(checked_host)]
+
+
+class Deadline:
+    """When one question of the user has to be answered, however many the link makes of it.
+
+    `timeout_s` from its beginning; where a connection was lost meanwhile, `reconnect_s` from its beginning.
+    """
+
+    def __init__(self, timeout_s: float, reconnect_s: float = 0.0) -> None:
+        self.timeout_s, self.start_s = timeout_s, time.monotonic()
+        self.end_s = self.start_s + timeout_s
+        self._end_after_loss_s = self.start_s + max(timeout_s, reconnect_s)
+
+    def lose(self) -> None:
+        """Grant the time for a lost connection."""
+        self.end_s = self._end_after_loss_s
+
+
+@dataclass(frozen=True)
+class Answer(Generic[T]):
+    """What a reply said, when the question was sent, and when the reply was there; monotonic clock."""
+
+    value: T
+    asked_s: float
+    told_s: float
 
 
 class ConnectionLost(DeviceError):
@@ -74,12 +103,19 @@ class TcpTransport:
     @classmethod
     def connect(cls, host: str, port: int, deadline_s: float) -> TcpTransport:
         """Open a connection."""
-        try:
-            return cls(socket.create_connection((host, port), _remaining(deadline_s)))
-        except (TimeoutError, BlockingIOError) as error:
+        error: OSError | None = None
+        for family, kind, protocol, _, address in addresses(host, port, deadline_s):
+            peer = socket.socket(family, kind, protocol)
+            try:
+                peer.settimeout(max(_remaining(deadline_s), 1e-3))
+                peer.connect(address)
+                return cls(peer)
+            except OSError as failed:
+                peer.close()
+                error = failed
+        if isinstance(error, TimeoutError | BlockingIOError):
             raise DeviceTimeout("no answer to the connection request") from error
-        except OSError as error:
-            raise ConnectionLost(f"cannot connect: {error.strerror or error}") from error
+        raise ConnectionLost(f"cannot connect: {(error and error.strerror) or error}") from error
 
     def send(self, data: bytes, deadline_s: float) -> None:
         """Send all of it."""
@@ -116,6 +152,26 @@ class TcpTransport:
         self._socket.close()
 
 
+def addresses(host: str, port: int, deadline_s: float) -> list[Any]:
+    """Return what `socket.getaddrinfo` says of a TCP server, but in time: a name server may be silent for long."""
+    found: queue.SimpleQueue[list[Any] | OSError] = queue.SimpleQueue()
+
+    def look_up() -> None:
+        try:
+            found.put(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM))
+        except OSError as error:
+            found.put(error)
+
+    threading.Thread(target=look_up, daemon=True).start()
+    try:
+        answer = found.get(timeout=max(_remaining(deadline_s), 0.05))
+    except queue.Empty:
+        raise DeviceTimeout(f"no name server tells the address of {host}") from None
+    if isinstance(answer, OSError):
+        raise ConnectionLost(f"cannot connect: {answer.strerror or answer}") from answer
+    return answer
+
+
 class FileTransport:
     """A file descriptor that is read and written, such as one end of a pseudo-terminal."""
 
@@ -125,7 +181,8 @@ class FileTransport:
     def send(self, data: bytes, deadline_s: float) -> None:
         """Send all of it."""
         while data:
-            if not select.select([], [self._fd], [], _remaining(deadline_s))[1]:
+            left_s = _remaining(deadline_s)
+            if left_s == 0.0 or not select.select([], [self._fd], [], left_s)[1]:
                 raise DeviceTimeout("does not take what is sent")
             data = data[os.write(self._fd, data[:1024]) :]
 
@@ -196,25 +253,43 @@ class Link:
             except DeviceError as error:
                 raise type(error)(f"{self.name}: {error}") from error
 
-    def ask(self, request: bytes, read: Callable[[bytes], T], repeat: bool = True, timeout_s: float | None = None) -> T:
+    def deadline(self) -> Deadline:
+        """Begin a question of the user."""
+        return Deadline(self.timeout_s, self.reconnect_s)
+
+    def ask(
+        self,
+        request: bytes,
+        read: Callable[[bytes], T],
+        repeat: bool = True,
+        deadline: Deadline | None = None,
+        beat: bytes | None = None,
+    ) -> Answer[T]:
         """Send the request and give what `read` makes of the one reply.
 
-        `read` raises `DeviceError` or `InputError` on a reply that is not the answer.
+        `read` raises `DeviceError` or `InputError` on a reply that is not the answer. `deadline` is of the question of
+        the user that this one is a part of; without one it is a question of its own. `beat` is said every half second
+        until the reply comes.
         """
-        with self._lock:
-            give_up_s = time.monotonic() + self.reconnect_s
+        deadline = deadline or self.deadline()
+        if not self._lock.acquire(timeout=max(_remaining(deadline.end_s), 1e-3)):
+            raise DeviceTimeout(f"{self.name}: busy with another question")
+        try:
             pause_s = FIRST_PAUSE_S
             while True:
-                deadline_s = time.monotonic() + (self.timeout_s if timeout_s is None else timeout_s)
+                end_s = min(deadline.end_s, time.monotonic() + deadline.timeout_s)
                 try:
-                    messages = self._stream(deadline_s)
-                    messages.transport.send(request, deadline_s)
-                    answer = read(messages.next(deadline_s))
+                    messages = self._stream(end_s)
+                    asked_s = time.monotonic()
+                    messages.transport.send(request, end_s)
+                    value = read(messages.next(end_s) if beat is None else _awaited(messages, beat, end_s))
                     self.last_used_s = time.monotonic()
-                    return answer
+                    return Answer(value, asked_s, self.last_used_s)
                 except ConnectionLost as error:
                     self._drop()
-                    if not repeat or time.monotonic() + pause_s > give_up_s:
+                    if repeat:
+                        deadline.lose()
+                    if not repeat or time.monotonic() + pause_s > deadline.end_s:
                         raise type(error)(f"{self.name}: {error}") from error
                 except (DeviceError, InputError) as error:
                     self._drop()
@@ -225,6 +300,13 @@ class Link:
                     raise
                 time.sleep(pause_s)
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+        finally:
+            self._lock.release()
+
+    def renew(self) -> None:
+        """Hang up and begin anew, after an interrupt that may have struck anywhere, the lock included."""
+        self._lock = threading.Lock()
+        self._drop()
 
     def close(self) -> None:
         """Close the connection."""
@@ -247,13 +329,27 @@ class Link:
             self._messages = None
 
 
+def _awaited(messages: Messages, beat: bytes, deadline_s: float) -> bytes:
+    while True:
+        try:
+            return messages.next(min(time.monotonic() + BEAT_S, deadline_s))
+        except DeviceTimeout:
+            if time.monotonic() >= deadline_s:
+                raise
+            messages.transport.send(beat, deadline_s)
+
+
 _ROOT = re.compile(rb"\s*(?:<\?xml[^<>]*\?>\s*)?<([A-Za-z_][\w.-]*)")
+_DECLARED = re.compile(rb"""\s*<\?xml[^<>]*?\sencoding\s*=\s*["']([^"'<>]*)["']""")
+ENCODINGS = ("utf-8", "us-ascii", "ascii")
 
 
 def cut_xml(buffer: bytearray) -> bytes | None:
     """Cut one XML document, which ends with the closing tag of its root; no DTD, no comment, no CDATA."""
     if b"<!" in buffer:
         raise DeviceError("XML with a DTD, entity, comment or CDATA section is refused")
+    if b"\0" in buffer:  # of UTF-16 and its like, in which every other search here would be blind
+        raise DeviceError("XML in another encoding than UTF-8 is refused")
     root = _ROOT.match(buffer)
     if root is None:
         if buffer.strip() and (not buffer.lstrip().startswith(b"<") or len(buffer) > 256):
@@ -269,19 +365,44 @@ def cut_xml(buffer: bytearray) -> bytes | None:
     return message
 
 
+def xml_text(data: bytes) -> str:
+    """Return the text of an XML document. Before anything else looks at it: in UTF-16, or in UTF-7, a DTD hides from
+    every search for `<!`. Raises `DeviceError` for any encoding but UTF-8 and ASCII.
+    """
+    declared = _DECLARED.match(data)
+    if declared is not None and declared[1].decode("latin-1").lower() not in ENCODINGS:
+        raise DeviceError(f"XML in the encoding {declared[1][:20].decode('latin-1')!r} is refused: UTF-8 or ASCII")
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise DeviceError(f"XML in another encoding than UTF-8 is refused: {data[:40]!r}") from error
+    if "\0" in text:
+        raise DeviceError("XML in another encoding than UTF-8 is refused")
+    return text
+
+
 def parse_xml(data: bytes, root: str) -> ElementTree.Element:
-    """Parse a document that an outsider sent: small, without DTD and entities, and with the expected root."""
+    """Parse a document that an outsider sent: small, in UTF-8, without DTD and entities, and with the expected root."""
     if len(data) > LARGEST_MESSAGE:
         raise DeviceError(f"XML of {len(data)} bytes is refused")
-    if b"<!" in data:
+    text = xml_text(data)
+    if "<!" in text:
         raise DeviceError("XML with a DTD, entity, comment or CDATA section is refused")
     try:
-        element = ElementTree.fromstring(data)
+        element = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise DeviceError(f"not XML: {error}: {data[:40]!r}") from error
     if element.tag != root:
         raise DeviceError(f"XML with the root <{element.tag}>, expected <{root}>")
     return element
+
+
+def only(root: ElementTree.Element, path: str) -> ElementTree.Element | None:
+    """Return the one element at a path, None where there is none; raises `DeviceError` where there are several."""
+    found = root.findall(path)
+    if len(found) > 1:
+        raise DeviceError(f"{len(found)} elements <{path}>: which of them holds?")
+    return found[0] if found else None
 
 
 def _remaining(deadline_s: float) -> float:

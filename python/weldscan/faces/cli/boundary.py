@@ -137,6 +137,8 @@ def _not_now(frame: FrameType | None) -> bool:
         module, code = frame.f_globals.get("__name__", ""), frame.f_code
         if (
             code.co_filename.startswith("<frozen importlib")
+            # Its models are built when they are first used, and refuse everything when that was disturbed.
+            or module.partition(".")[0] == "pydantic"
             # The core looks at NumPy's version when it first meets an array, and cannot go on without.
             or module == "numpy.lib._version"
             # What is half opened nobody would close, and what is half closed stays: hidden folders, sockets, locks.

@@ -50,11 +50,13 @@ def hand_eye(
     are named and not used.
     """
     from weldscan.measure.session_hand_eye import calibrate as solve
+    from weldscan.records.files import check_file
     from weldscan.records.hand_eye import write_hand_eye
     from weldscan.report.hand_eye import write_hand_eye_page
     from weldscan.report.page import check_page
 
     page = page if page is not None else out.with_suffix(".html")
+    check_file(out)
     check_page(page)
     with shown_progress() as progress:
         found, noticed = solve(session, progress)
@@ -233,11 +235,13 @@ def scanner(
     """
     from weldscan.calibration.board import parse_board
     from weldscan.calibration.scanner import calibrate_scanner
+    from weldscan.records.files import check_file
     from weldscan.records.scanner import read_scanner, write_scanner
     from weldscan.report.page import check_page
     from weldscan.report.scanner import write_scanner_page
 
     page = out.with_suffix(".html")
+    check_file(out)
     if out.exists():
         read_scanner(out)
     check_page(page)
@@ -288,6 +292,17 @@ def _say(found: ScannerCalibration, out: Path, page: Path) -> None:
         f"        u of a point (k = 1, shape of the volume): {size[0]:.3f} mm in the middle, "
         f"{size[1]:.3f} mm {worst.name}"
     )
+    weld = found.weld
+    if weld.u_mm < float("inf"):
+        print(
+            f"        u of the step of a pipe of 219 mm at {weld.distance_mm:.0f} mm (k = 1, the calibration's part, "
+            f"propagated): {weld.u_mm:.3f} mm; {weld.inside:.0%} of its walls lie where the boards were"
+        )
+    if found.jackknife_ratio is not None:
+        print(
+            f"        leaving out poses: {found.jackknife_ratio:.2f} of what noise explains"
+            + ("; every uncertainty was scaled by it" if found.jackknife_ratio > 1 else "")
+        )
     for name, reason in found.left_out:
         print(f"        left out {name}: {reason}")
     for warning in found.warnings:
@@ -335,11 +350,12 @@ def response(
     light; three show only what they do to the phase.
     """
     from weldscan.calibration.response import parse_fringes, response_of_folder
-    from weldscan.records.files import write_file
+    from weldscan.records.files import check_file, write_file
     from weldscan.records.response import write_response
     from weldscan.report.response import response_svg
 
     sets = None if fringes is None else parse_fringes(fringes)
+    check_file(out)
     with shown_progress() as progress:
         progress(0, 1, f"reading {folder}")
         found = response_of_folder(folder, sets, shot=shot)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import sys
 import threading
 import time
@@ -146,18 +145,18 @@ def camera_preview(
     count: Annotated[int, typer.Option(min=0, help="How many frames; 0: until Ctrl-C.")] = 0,
 ) -> None:
     """Look through the camera: a picture that is written again and again, and the shares of useless pixels."""
-    from weldscan.records.files import write_file
+    from weldscan.records.files import check_file, write_file
     from weldscan.records.images import encode_png
-    from weldscan.station.capture import full_scale
     from weldscan.station.cell import read_cell
     from weldscan.station.check import LEAST_CONTRAST, overlay
 
-    done, out = 0, _in_a_folder(out)
+    done = 0
+    check_file(out)
     with read_cell(config).open("camera") as camera, contextlib.suppress(KeyboardInterrupt):
         while count == 0 or done < count:
             frame = camera.capture()
-            top = full_scale([frame.image])
-            write_file(out, encode_png(overlay(frame.image)))
+            top = frame.full_scale
+            write_file(out, encode_png(overlay(frame)))
             saturated, dark = (frame.image >= top).mean(), (frame.image <= LEAST_CONTRAST * top).mean()
             print(
                 f"{frame.image.shape[1]}x{frame.image.shape[0]}, {camera.exposure_s * 1000:g} ms: "
@@ -209,21 +208,27 @@ def devices_check(
 
     The response is the projector's own: a table that the configuration has already is not applied.
     """
+    from weldscan.records.files import check_file
     from weldscan.records.response import write_response
     from weldscan.station import check
     from weldscan.station.cell import read_cell
 
     cell = read_cell(config)
-    out = _in_a_folder(out if out is not None else config.parent / "response.json")
+    out = out if out is not None else config.parent / "response.json"
+    check_file(out)
+    if ramp is not None:
+        ramp.mkdir(parents=True, exist_ok=True)
+        check_file(ramp / "ramp.png")
     with cell.open("projector", response=None) as projector, cell.open("camera") as camera:
         exposure_s = check.prepare(camera, projector)
         print(f"exposure   {exposure_s * 1000:.3f} ms, {exposure_s * projector.settings.refresh_hz:.0f} refreshes")
         seconds = check.latency_s(camera, projector)
         print(f"latency    {max(seconds) * 1000:.1f} ms at most of {len(seconds)}: latency_s = {max(seconds):.3f}")
+        if camera.streams:
+            under_way = max(check.transfer_s(camera, projector))
+            print(f"transfer   {under_way * 1000:.1f} ms at most: [camera] transfer_s = {under_way:.3f}")
         shares = check.pixels(camera, projector)
         print(f"pixels     saturated {shares.saturated:.2%}, dark {shares.dark:.2%}")
-        if ramp is not None:
-            ramp.mkdir(parents=True, exist_ok=True)
         table = check.response(camera, projector, keep=ramp)
         write_response(out, table)
         named = out.name if out.parent == config.parent else out.resolve()
@@ -236,6 +241,9 @@ def scan(
     ] = None,
     config: Config = CELL,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a scan that was stopped.")] = False,
+    retake: Annotated[
+        bool, typer.Option("--retake", help="With --resume: set aside more than one damaged shot, and take them again.")
+    ] = False,
     example_config: Annotated[
         Path | None,
         typer.Option(
@@ -262,14 +270,18 @@ def scan(
     how = f"weldscan scan --config {config} --out {out} --resume"
     try:
         with shown_progress() as tell:
-            result = run(read_cell(config), out, resume, tell, _ask_the_operator)
+            result = run(read_cell(config), out, resume, tell, _ask_the_operator, retake)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"stopped; what was kept is whole. To go on: {how}") from None
     complete = result.whole >= result.planned
     with terminal.answer(0 if complete else NOT_MEASURED):
         print(f"{result.whole} of {result.planned} shots in {out}")
+        for each in result.set_aside:
+            print(f"       set aside {each.shot} as {each.folder}: {each.reason}")
         for name, reason in result.rejected:
             print(f"       rejected {name}: {reason}")
+        if result.seconds:
+            print(f"       seconds: {', '.join(f'{what} {each:.1f}' for what, each in result.seconds.items())}")
         print(f"       next: weldscan inspect {out}" if complete else f"       to go on: {how}")
 
 
@@ -278,13 +290,6 @@ def _ask_the_operator(shot: ShotSpec) -> None:
     print(f"Move the flange to {shot.name}{target}, then press Enter.", file=sys.stderr, flush=True)
     if not sys.stdin.readline():
         raise InputError(f"{shot.name}: nobody is there to say that the robot is at its pose")
-
-
-def _in_a_folder(out: Path) -> Path:
-    """What cannot be written there is told before anything is measured."""
-    if not out.parent.is_dir() or out.is_dir():
-        raise InputError(f"--out: {out}: {'is a folder' if out.is_dir() else f'no such folder: {out.parent}'}")
-    return out
 
 
 def _robot(config: Path) -> Robot:
@@ -333,15 +338,13 @@ def _inject(controller: Controller, request: str) -> None:
 
 
 def _pose(words: list[str]) -> KukaPose:
-    from weldscan.pose import KukaPose
+    from weldscan.pose import KukaPose, parse_number
 
     try:
-        values = [float(word) for word in words]
+        x, y, z, a, b, c = map(parse_number, words)
     except ValueError:
         raise InputError(f"pose: {' '.join(words)!r} is not six numbers") from None
-    if len(values) != 6 or not all(map(math.isfinite, values)):
-        raise InputError(f"pose: {' '.join(words)!r} is not six numbers")
-    return KukaPose(*values)
+    return KukaPose(x, y, z, a, b, c)
 
 
 def _show(pose: StampedPose, to_a_person: bool) -> None:

@@ -12,137 +12,41 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator
-from enum import StrEnum
 from types import TracebackType
 from typing import Self
 
-import numpy as np
-
-from weldscan.devices.robots import distance
 from weldscan.devices.robots.wire import Cut, Messages, TcpTransport, Transport
 from weldscan.errors import DeviceError, DeviceTimeout
-from weldscan.geometry import rigid, rotation_of, rotation_vector_of
-from weldscan.pose import KukaPose
-from weldscan.simulated.controllers.kinematics import ArmGeometry, Joints
+from weldscan.simulated.controllers.arm import (
+    HOME,
+    HOME_JOINTS,
+    NULL_FRAME,
+    T1_SPEED_MM_S,
+    TURN_SPEED_DEG_S,
+    Arm,
+    LinkFault,
+    OutOfReach,
+)
 
-HOME_JOINTS: Joints = (0.0, -90.0, 90.0, 0.0, 30.0, 0.0)
-HOME = KukaPose.from_matrix(ArmGeometry().flange(HOME_JOINTS))
-NULL_FRAME = KukaPose(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-T1_SPEED_MM_S = 250.0
-TURN_SPEED_DEG_S = 90.0
+__all__ = [
+    "HOME",
+    "HOME_JOINTS",
+    "HUGE_BYTES",
+    "LOOK_S",
+    "NULL_FRAME",
+    "T1_SPEED_MM_S",
+    "TURN_SPEED_DEG_S",
+    "Arm",
+    "Controller",
+    "LinkFault",
+    "OutOfReach",
+    "StreamController",
+    "TcpController",
+]
+
 HUGE_BYTES = 10_000_000
 LOOK_S = 0.05
 """How often a serving thread looks whether it shall stop."""
-
-
-class LinkFault(StrEnum):
-    """What a simulated controller does wrong with one reply. Not every link can commit every fault."""
-
-    SILENCE = "silence"
-    BYTES = "bytes"
-    """The reply comes in single bytes, each in its own packet."""
-    TWICE = "twice"
-    """The reply comes twice, in one packet."""
-    WRONG_ID = "wrong-id"
-    WRONG_LENGTH = "wrong-length"
-    EMPTY = "empty"
-    GARBAGE = "garbage"
-    HUGE = "huge"
-    """10 MB where a few hundred bytes should be."""
-    DTD = "dtd"
-    ENTITY = "entity"
-    RESET = "reset"
-    """The connection is reset in the middle of the reply."""
-    RESTART = "restart"
-    """The controller goes away and comes back a second later."""
-    NAN = "nan"
-    JUMP = "jump"
-    """One pose is 400 mm off."""
-    STALE = "stale"
-    """The pose stands at what it was, or the stream repeats itself, although the arm moves."""
-
-
-class OutOfReach(DeviceError):
-    """No way of holding its joints brings the arm there."""
-
-
-class Arm:
-    """A simulated robot: its flange moves straight at a constant speed and the joints follow; it tells $POS_ACT in its
-    tool and base.
-    """
-
-    def __init__(
-        self, flange: KukaPose = HOME, tool: KukaPose = NULL_FRAME, base: KukaPose = NULL_FRAME, mode: str = "#T1"
-    ) -> None:
-        self.tool, self.base, self.mode, self.interpolation = tool, base, mode, "#BASE"
-        self._geometry, self._joints = ArmGeometry(), HOME_JOINTS
-        self._held: KukaPose | None = None
-        """The flange that these joints hold."""
-        self._aim: Joints | None = None
-        """The joints that a motion was to end in, if they were what it was given by."""
-        self.speed_mm_s, self.turn_speed_deg_s = T1_SPEED_MM_S, TURN_SPEED_DEG_S
-        self._start_s, self._seconds = time.monotonic(), 0.0
-        self._frozen: KukaPose | None = None
-        self.place(flange)
-
-    def flange(self) -> KukaPose:
-        """Return where the flange is now."""
-        done = 1.0 if self._seconds == 0 else min((time.monotonic() - self._start_s) / self._seconds, 1.0)
-        if done == 1.0:
-            return self._target
-        a, b = self._start.matrix(), self._target.matrix()
-        turn = a[:3, :3] @ rotation_of(done * rotation_vector_of(a[:3, :3].T @ b[:3, :3]))
-        return KukaPose.from_matrix(rigid(turn, (1 - done) * a[:3, 3] + done * b[:3, 3]))
-
-    @property
-    def moving(self) -> bool:
-        """Is the arm on its way?"""
-        return time.monotonic() < self._start_s + self._seconds
-
-    @property
-    def joints_deg(self) -> Joints:
-        """A1 to A6 now: of the ways to hold the flange the one nearest to where the joints were.
-
-        Where a motion was given by its joints it ends in those.
-        """
-        flange = self.flange()
-        if self._aim is not None and not self.moving:
-            self._joints, self._held = self._aim, flange
-        if flange != self._held:
-            self._joints = self._geometry.joints(flange.matrix(), self._joints) or self._joints
-            self._held = flange
-        return self._joints
-
-    def move(self, target: KukaPose) -> None:
-        """Set off for a flange pose. Raises `OutOfReach`, and stays."""
-        if self._geometry.joints(target.matrix(), self._joints) is None:
-            raise OutOfReach(f"{target} is out of the arm's reach")
-        self._start = self.flange()
-        far_mm, far_deg = distance(self._start, target)
-        self._start_s = time.monotonic()
-        self._seconds = max(far_mm / self.speed_mm_s, far_deg / self.turn_speed_deg_s)
-        self._target, self._aim = target, None
-
-    def move_joints(self, joints_deg: Joints) -> None:
-        """Set off for a pose that is given by its joints."""
-        self.move(KukaPose.from_matrix(self._geometry.flange(joints_deg)))
-        self._aim = joints_deg
-
-    def place(self, target: KukaPose) -> None:
-        """Be at a pose at once, as when an operator has jogged the arm there; for a far one the arm is a larger one."""
-        while self._geometry.joints(target.matrix(), self._joints) is None:
-            self._geometry = self._geometry.larger(2.0)
-        self._start = self._target = target
-        self._seconds, self._aim = 0.0, None
-
-    def position(self, fault: LinkFault | None = None) -> KukaPose:
-        """Return $POS_ACT: the tool in base."""
-        flange = self.flange()
-        self._frozen = (self._frozen or flange) if fault is LinkFault.STALE else None
-        flange = self._frozen or flange
-        if fault is LinkFault.JUMP:
-            flange = KukaPose(flange.x_mm + 400.0, *flange.values()[1:])
-        return KukaPose.from_matrix(np.linalg.inv(self.base.matrix()) @ flange.matrix() @ self.tool.matrix())
 
 
 class Controller:
@@ -215,7 +119,6 @@ class StreamController(Controller, ABC):
             case LinkFault.BYTES:
                 for byte in reply:
                     yield bytes([byte])
-                    time.sleep(0.0002)
             case LinkFault.TWICE:
                 yield reply + reply
             case LinkFault.GARBAGE:
@@ -250,6 +153,9 @@ class TcpController(StreamController):
         self._thread.join(5.0)
         self._hang_up()
 
+    def _restarted(self) -> None:
+        """Begin anew what a restarted controller begins anew."""
+
     def _listen(self, port: int) -> socket.socket:
         listener = socket.create_server((self.host, port))
         listener.settimeout(LOOK_S)
@@ -261,6 +167,7 @@ class TcpController(StreamController):
                 self._listener.close()
                 self._hang_up()
                 self._stop.wait(self.restart_s)
+                self._restarted()
                 self._away.clear()
                 self._listener = self._listen(self.port)
             try:

@@ -1,8 +1,10 @@
-"""A simulated controller that speaks KUKAVARPROXY or C3 Bridge."""
+"""A simulated controller that speaks KUKAVARPROXY or C3 Bridge, with `krl/weldscan_kvp.src` running on it."""
 
 from __future__ import annotations
 
+from weldscan.devices.robots import RESPITE_S
 from weldscan.devices.robots.kvp import (
+    LEASE,
     PROGRAM,
     READ,
     READ_MANY,
@@ -15,27 +17,95 @@ from weldscan.devices.robots.kvp import (
     encode_reply,
     framed,
 )
+from weldscan.devices.robots.program import Status
 from weldscan.errors import InputError
-from weldscan.pose import format_e6axis, format_e6pos, format_frame, parse_frame
-from weldscan.simulated.controllers import Arm, LinkFault, OutOfReach, TcpController
+from weldscan.pose import format_e6axis, format_e6pos, format_frame, parse_frame, parse_number, parse_whole
+from weldscan.simulated.controllers import Arm, LinkFault, TcpController
+from weldscan.simulated.controllers.interpreter import Interpreter, Program, Timer
+from weldscan.simulated.controllers.program import Driver
+
+NUMBERS = ("COM_ACTION", "COM_GO", "COM_TAKEN", "COM_DONE", "COM_STATUS")
 
 
 class KvpController(TcpController):
-    """A simulated controller with KUKAVARPROXY or C3 Bridge, our motion program running on it."""
+    """A simulated controller with KUKAVARPROXY or C3 Bridge, our motion program running on it.
+
+    `variables["$PRO_STATE1"]` is the start key: at #P_STOP program and arm stand, at #P_ACTIVE they go on.
+    """
 
     def __init__(self, arm: Arm | None = None, host: str = "127.0.0.1", port: int = 0, c3: bool = False) -> None:
         self.c3 = c3
         self.variables = {
-            "COM_ACTION": "0",
+            **dict.fromkeys(NUMBERS, "0"),
             "COM_TARGET": "",
+            "COM_GOAL": "",
             "$PRO_NAME1[]": f'"{PROGRAM}"',
             "$PRO_STATE1": "#P_ACTIVE",
         }
+        self.lease = Timer()
         super().__init__(arm, host, port)
+        self.interpreter = Interpreter(
+            self.arm, self._program, lambda: self.variables["$PRO_STATE1"] == "#P_ACTIVE" and not self._away.is_set()
+        )
+        self._driver = Driver(self.arm, self.interpreter)
+        self.interpreter.start()
+
+    def close(self) -> None:
+        """Stop serving and hang up on everyone."""
+        super().close()
+        self.interpreter.close()
+
+    def _restarted(self) -> None:
+        self.interpreter.reset()
 
     def cut(self, buffer: bytearray) -> bytes | None:
         """Cut one request."""
         return cut_frame(buffer)
+
+    # --- WELDSCAN_KVP -------------------------------------------------------------------------------------------------
+
+    def _program(self) -> Program:
+        for name in NUMBERS:
+            self.variables[name] = "0"
+        self.lease.set(0)
+        yield
+        while True:
+            while self._number("COM_ACTION") == 0:
+                yield
+            request = self._number("COM_ACTION")
+            self._driver.status = Status.LAPSED
+            yield from self._take(request)
+            self.lease.set(0)
+            self.variables |= {"COM_GO": "0", "COM_TAKEN": "0", "COM_STATUS": str(int(self._driver.status))}
+            self.variables["COM_DONE"] = str(request)
+            if self._number("COM_ACTION") == request:
+                self.variables["COM_ACTION"] = "0"
+            yield
+
+    def _take(self, request: int) -> Program:
+        goal = self.variables["COM_GOAL"] = self.variables["COM_TARGET"]
+        try:
+            if not self._driver.look(parse_frame(goal)):
+                return
+        except InputError:
+            self._driver.status = Status.GARBLED
+            return
+        self._driver.status = Status.LAPSED
+        self.variables["COM_GO"] = "0"
+        self.lease.set(-1000 * RESPITE_S)
+        self.variables["COM_TAKEN"] = str(request)
+        while not (self._number("COM_GO") == request or self._number("COM_ACTION") != request or self.lease.flag):
+            yield
+        if self._number("COM_GO") == request == self._number("COM_ACTION"):
+            yield from self._driver.drive(lambda: self.lease.flag)
+
+    def _number(self, name: str) -> int:
+        try:
+            return parse_whole(self.variables[name])
+        except InputError:
+            return 0
+
+    # --- KUKAVARPROXY -------------------------------------------------------------------------------------------------
 
     def answer(self, request: bytes, fault: LinkFault | None) -> bytes:
         """Read or write variables."""
@@ -61,8 +131,6 @@ class KvpController(TcpController):
 
     def _get(self, name: str, fault: LinkFault | None) -> str | None:
         arm = self.arm
-        if name == "COM_ACTION" and not arm.moving and self.variables["$PRO_STATE1"] == "#P_ACTIVE":
-            return "0"
         match name:
             case "$POS_ACT":
                 text = format_e6pos(arm.position(fault))
@@ -73,6 +141,8 @@ class KvpController(TcpController):
                 return format_frame(arm.tool)
             case "$BASE":
                 return format_frame(arm.base)
+            case "$TIMER[16]":
+                return str(round(self.lease.milliseconds))
             case "$IPO_MODE":
                 return arm.interpolation
             case "$MODE_OP":
@@ -83,10 +153,7 @@ class KvpController(TcpController):
                 return self.variables.get(name)
 
     def _set(self, name: str, value: str) -> None:
-        self.variables[name] = value
-        # As the program does it: it looks at COM_ACTION when it has arrived, and in T1 alone.
-        if name == "COM_ACTION" and value == "1" and self.arm.mode == "#T1" and not self.arm.moving:
-            try:
-                self.arm.move(parse_frame(self.variables["COM_TARGET"]))
-            except (OutOfReach, InputError):  # the controller stops a program that it cannot go on with
-                self.variables["$PRO_STATE1"] = "#P_STOP"
+        if name == LEASE:
+            self.lease.set(parse_number(value))
+        else:
+            self.variables[name] = value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import secrets
 import socket
 import threading
 import time
@@ -42,8 +43,9 @@ class RsiController(Controller):
 
     def packet(self, fault: LinkFault | None = None) -> bytes:
         """Return what one cycle sends."""
-        pose = dict(zip(CARTESIAN, self.arm.position(fault).values(), strict=True))
-        joints = dict(zip(JOINTS, self.arm.joints_deg, strict=True))
+        position, joints_deg = self.arm.told(fault)
+        pose = dict(zip(CARTESIAN, position.values(), strict=True))
+        joints = dict(zip(JOINTS, joints_deg, strict=True))
         text = (
             f'<Rob Type="KUKA"><RIst {_attributes(pose)}/><RSol {_attributes(pose)}/><AIPos {_attributes(joints)}/>'
             f'<Delay D="{self.late}"/><IPOC>{self.ipoc}</IPOC></Rob>'
@@ -69,7 +71,7 @@ class RsiController(Controller):
         while not self._stop.is_set():
             fault = self._next_fault()
             if fault is LinkFault.RESTART:
-                self.ipoc = 1000
+                self.ipoc = 1000 + secrets.randbelow(1000)  # no start takes as long as another
                 if self._stop.wait(1.0):
                     break
                 next_s = time.monotonic()

@@ -285,7 +285,7 @@ fn saturation_level(py: Python<'_>, images: &Bound<'_, PyAny>) -> PyResult<(f64,
         [height, width]: [usize; 2],
     ) -> PyResult<(f64, f64, bool)> {
         let shot = Shot { exposures: vec![slices(arrays)?], width, height };
-        let found = compute(py, || Ok(saturation(&shot)))?;
+        let found = compute(py, || Ok(saturation(&shot, None)))?;
         Ok((found.level, found.full_scale, found.below_full_scale))
     }
     let (found, size) = super::images::images("images", images)?;

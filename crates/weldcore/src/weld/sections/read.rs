@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use super::cap::Candidate;
 use super::direction::Direction;
-use super::profile::Profile;
+use super::foot::{self, FlankFoot};
 use super::station::{Edge, Kind, Station, running_median};
 use super::toes::Toe;
 use super::view::{FLUSH_GAP_MM, Found, View};
@@ -25,6 +25,8 @@ const WANDER_WIDTHS: f64 = 0.06;
 /// takes for itself: what is left of a cap 0.9 mm high runs out over so much at a toe angle of 150 degrees.
 const HIDDEN_ABOUT_MM: [f64; 2] = [3.0, 1.5];
 const HIDDEN_MM: f64 = 1.5;
+/// Where an end that flares begins is known to this.
+const FLARE_MM: f64 = 0.6;
 /// Thicker walls are bevelled down to thinner ones by 15 degrees at most (PNAE G-7-009, GOST 16037: 12 to 15).
 const STEEPEST_BEVEL: f64 = 0.27;
 /// What is the wall's own is there in so many neighbours on either side too.
@@ -45,7 +47,7 @@ impl View<'_> {
         let n = profile.len();
         let band = band.map(|[low, high]| [-high, -low]);
         let toe = toes::toe(profile, n - candidate.to, n - candidate.from, self.sigma, band)?;
-        Some(Toe { at: -toe.at, from: -toe.to, to: -toe.from })
+        Some(Toe { at: -toe.at, from: -toe.to, to: -toe.from, ..toe })
     }
 
     pub(super) fn stations(&self, found: &Found) -> Vec<Station> {
@@ -59,7 +61,7 @@ impl View<'_> {
                         let c = chosen[k].as_ref()?;
                         if found.kind == Kind::Flush {
                             let at = c.toes[side];
-                            return Some(Toe { at, from: at, to: at });
+                            return Some(Toe { at, from: at, to: at, undercut_mm: 0.0 });
                         }
                         self.toe(k, c, side, None)
                     })
@@ -75,12 +77,22 @@ impl View<'_> {
                 (0..count).filter_map(|k| Some(toes[k][side]?.at - found.course.at(self.along(k)))).collect();
             if off.is_empty() { 0.0 } else { median(&mut off) }
         });
-        let (mut stations, toes): (Vec<Station>, Vec<[Toe; 2]>) =
+        let (mut stations, mut toes): (Vec<Station>, Vec<[Toe; 2]>) =
             threads::install(|| (0..count).into_par_iter().map(|k| self.station(k, found, toes[k], usual)).unzip());
+        if found.kind == Kind::Raised {
+            for (k, moved) in self.flares(found, &stations, &toes).into_iter().enumerate() {
+                if let Some(moved) = moved {
+                    (stations[k], toes[k]) = self.station(k, found, moved.map(Some), usual);
+                }
+            }
+        }
         for (side, scatter) in [0, 1].map(|side| (side, toe_scatter(&stations, side))) {
             stations.iter_mut().for_each(|s| s.toes_standard_mm[side] = s.toes_standard_mm[side].hypot(scatter));
         }
-        let directions = direction::directions(&stations);
+        let local: Vec<Option<f64>> =
+            threads::install(|| (0..count).into_par_iter().map(|k| self.local_step(&stations, k)).collect());
+        stations.iter_mut().zip(local).for_each(|(station, local)| station.local_step_mm = local);
+        let directions = direction::directions(&stations, self.grid.course);
         let read: Vec<Option<(Edge, Bevels)>> = threads::install(|| {
             let read = |k: usize| {
                 let station = &stations[k];
@@ -116,14 +128,14 @@ impl View<'_> {
                 let Some(usual) = running_median(&at, k, 4) else { continue };
                 if (own - usual).abs() > band {
                     // Where a hole is in its place, it is known from its neighbours alone.
-                    let by_neighbours = Toe { at: usual, from: usual - band, to: usual + band };
+                    let by_neighbours = Toe { at: usual, from: usual - band, to: usual + band, undercut_mm: 0.0 };
                     let again = self.toe(k, c, side, Some([usual - band, usual + band])).unwrap_or(by_neighbours);
                     // What the free search found stays plausible.
                     let first = toes[k][side].map_or([own, own], |t| [t.from, t.to]);
                     let kept = (first[0] - usual).abs().max((first[1] - usual).abs()) <= 2.0 * band;
                     let (from, to) =
                         if kept { (again.from.min(first[0]), again.to.max(first[1])) } else { (again.from, again.to) };
-                    toes[k][side] = Some(Toe { at: again.at, from, to });
+                    toes[k][side] = Some(Toe { from, to, ..again });
                 }
             }
         }
@@ -135,7 +147,7 @@ impl View<'_> {
         let by_course = toes.iter().any(Option::is_none);
         let toes: [Toe; 2] = std::array::from_fn(|side| {
             let at = middle + usual[side];
-            toes[side].unwrap_or(Toe { at, from: at - WANDER_MM, to: at + WANDER_MM })
+            toes[side].unwrap_or(Toe { at, from: at - WANDER_MM, to: at + WANDER_MM, undercut_mm: 0.0 })
         });
         let own = &self.own[k];
         let seen = {
@@ -160,6 +172,7 @@ impl View<'_> {
             },
             height_mm: 0.0,
             edge: None,
+            local_step_mm: None,
             undisturbed_mm: [None; 2],
             departure_mm: [0.0; 2],
             wall_step_mm: None,
@@ -237,7 +250,12 @@ impl View<'_> {
                 hull_mm: hull + direction.spread * width,
                 foot_mm: foot,
             };
-            Some((edge, if flush { [None; 2] } else { [a.bevel, b.bevel] }))
+            let bevel = |side: usize, read: Option<[f64; 2]>| match read {
+                _ if flush => None,
+                Some([off, _]) if off.abs() < toes[side].undercut_mm => Some([toes[side].undercut_mm, self.sigma]),
+                read => read,
+            };
+            Some((edge, [bevel(0, a.bevel), bevel(1, b.bevel)]))
         };
         let middle = 0.5 * (toes[0].at + toes[1].at);
         if found.kind == Kind::Flush {
@@ -299,15 +317,59 @@ impl View<'_> {
     /// Where a flank flattens outward, metal that looks like the foot of the cap may be the wall's own edge (an end that
     /// flares within a few millimetres has no kink at its toe): its height over the surface beside the toe, both sides.
     fn foot(&self, k: usize, found: &Found, toes: &[Toe; 2], beside: [f64; 2]) -> f64 {
-        let sign = if found.kind == Kind::Hollow { -1.0 } else { 1.0 };
         (0..2)
-            .map(|side| {
-                let profile = &self.smooth[k][side];
-                let toe = if side == 0 { -toes[0].at } else { toes[1].at };
-                let far = if side == 0 { -toes[1].at } else { toes[0].at };
-                foot(profile, toe, far, beside[side], sign, self.sigma)
-            })
+            .filter_map(|side| self.foot_of(k, found, toes, side).map(|foot| (foot.height - beside[side]).abs()))
             .sum()
+    }
+
+    fn foot_of(&self, k: usize, found: &Found, toes: &[Toe; 2], side: usize) -> Option<FlankFoot> {
+        let sign = if found.kind == Kind::Hollow { -1.0 } else { 1.0 };
+        let [toe, far] = if side == 0 { [-toes[0].at, -toes[1].at] } else { [toes[1].at, toes[0].at] };
+        foot::foot(&self.smooth[k][side], toe, far, sign, self.sigma)
+    }
+
+    /// Toes that were found in the tail of an end that flares, put to where it begins: where most neighbours tell the same.
+    fn flares(&self, found: &Found, stations: &[Station], toes: &[[Toe; 2]]) -> Vec<Option<[Toe; 2]>> {
+        let ends: Vec<[Option<f64>; 2]> = (0..stations.len())
+            .map(|k| {
+                [0, 1].map(|side| {
+                    let (wall, foot) = (stations[k].walls[side]?, self.foot_of(k, found, &toes[k], side)?);
+                    let crown = self.crown(k, toes[k].map(|toe| toe.at));
+                    foot::flare(&self.smooth[k][side], foot, if side == 0 { -crown } else { crown }, &wall)
+                })
+            })
+            .collect();
+        (0..stations.len())
+            .map(|k| {
+                let near = k.saturating_sub(NEIGHBOURS)..(k + NEIGHBOURS + 1).min(ends.len());
+                let moved = [0, 1].map(|side| {
+                    let mut all: Vec<f64> = ends[near.clone()].iter().filter_map(|e| e[side]).collect();
+                    if all.len() <= near.len() / 2 { None } else { Some(ends[k][side].unwrap_or(median(&mut all))) }
+                });
+                moved.iter().any(Option::is_some).then(|| {
+                    [0, 1].map(|side| {
+                        let sign = if side == 0 { -1.0 } else { 1.0 };
+                        let about = |x: f64| Toe {
+                            at: sign * x,
+                            from: sign * x - FLARE_MM,
+                            to: sign * x + FLARE_MM,
+                            undercut_mm: 0.0,
+                        };
+                        moved[side].map_or(toes[k][side], about)
+                    })
+                })
+            })
+            .collect()
+    }
+
+    /// Where a cap is highest.
+    fn crown(&self, k: usize, toes: [f64; 2]) -> f64 {
+        let profile = &self.smooth[k][1];
+        let (from, to) = (profile.boundary(toes[0]), profile.boundary(toes[1]));
+        let highest = (from..to).filter(|&i| profile.heights[i].is_finite());
+        highest
+            .max_by(|&a, &b| profile.heights[a].total_cmp(&profile.heights[b]))
+            .map_or(0.5 * (toes[0] + toes[1]), |i| profile.x(i))
     }
 }
 
@@ -330,40 +392,4 @@ fn bevel(near: &[Bevels], side: usize) -> f64 {
     let noise = median(&mut lines.iter().map(|l| l[1]).collect::<Vec<_>>());
     let seen = edges::FLANK_LIGHT_MM + 3.0 * MEDIAN_EFFICIENCY * noise / (lines.len() as f64).sqrt();
     if off > seen { off } else { 0.0 }
-}
-
-/// The flank's slope is that of windows of a millimetre.
-const FLANK_WINDOW_MM: f64 = 1.0;
-const ROUNDED_MM: f64 = 0.35;
-/// A cap is steepest at its toe, but for its ripples. Where the last millimetre has less than this part of the steepest
-/// slope, it may be something else than the cap.
-const FOOT_SLOPE: f64 = 0.5;
-/// A flank that hides behind its cap shows no foot: at least this part of it must be seen.
-const FLANK_PART: f64 = 0.7;
-
-fn foot(profile: &Profile, toe: f64, far: f64, beside: f64, sign: f64, sigma: f64) -> f64 {
-    // The last strip is rounded by the toe itself and by the size of a pixel.
-    let (from, to) = (profile.boundary(0.5 * (toe + far)), profile.boundary(toe - ROUNDED_MM));
-    let window = profile.in_bins(FLANK_WINDOW_MM).max(3);
-    if to < from + 2 * window {
-        return 0.0;
-    }
-    let steep: Vec<(f64, f64, f64)> = (from..=to - window)
-        .filter_map(|i| {
-            profile
-                .line(i, i + window)
-                .map(|l| (0.5 * (profile.edge(i) + profile.edge(i + window)), -sign * l.slope, sigma / l.sxx.sqrt()))
-        })
-        .collect();
-    let Some(&(_, last, se)) = steep.last() else { return 0.0 };
-    let most = steep.iter().map(|s| s.1).fold(0.0, f64::max);
-    let Some(&(x, _, _)) = steep.iter().rev().find(|s| s.1 >= 0.9 * most) else { return 0.0 };
-    if last >= FOOT_SLOPE * most - 2.0 * se || toe - ROUNDED_MM - x <= FLANK_WINDOW_MM {
-        return 0.0;
-    }
-    let at = profile.boundary(x);
-    if profile.count(at, to) < FLANK_PART * (to - at) as f64 {
-        return 0.0;
-    }
-    profile.mean(at.saturating_sub(1), (at + 1).min(profile.len())).map_or(0.0, |(_, h)| (h - beside).abs())
 }

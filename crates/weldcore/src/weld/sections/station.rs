@@ -58,6 +58,9 @@ pub struct Station {
     pub height_mm: f64,
     /// The edge step, where both surfaces beside the toes are there.
     pub edge: Option<Edge>,
+    /// How far the step of the surfaces is off that of the two neighbours at the same places, where it is more than noise: what
+    /// else is read off them is spatter, or a toe that is taken elsewhere.
+    pub local_step_mm: Option<f64>,
     /// From where outward each wall is undisturbed, across the seam.
     pub undisturbed_mm: [Option<f64>; 2],
     /// How far the surface between toe and undisturbed wall departs from the straight wall.

@@ -18,12 +18,21 @@ const PLAUSIBLE: f64 = 10.0;
 /// The range of plausible toes reaches to so many standard deviations, as chi-square has it for one place.
 pub(super) const PLAUSIBLE_SIGMAS: f64 = 3.0;
 
+/// Undercuts are no wider than this; they are seen from this depth on, beside a wall that is straight over so much.
+const UNDERCUT_MM: f64 = 2.5;
+const UNDERCUT_SEEN_MM: f64 = 0.03;
+const UNDERCUT_WALL_MM: f64 = 6.0;
+/// And comes back to itself between the undercut and where it is looked at.
+const QUIET_MM: f64 = 1.0;
+
 /// A toe with the range in which it may as well be.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Toe {
     pub at: f64,
     pub from: f64,
     pub to: f64,
+    /// Depth of an undercut inside it, drawn on to its inner side: it may as well be a bevel of the wall.
+    pub undercut_mm: f64,
 }
 
 /// The toe of a cap whose candidate ends at the bin boundary `end` and begins at `begin`; `band` narrows the search.
@@ -67,7 +76,27 @@ pub(super) fn toe(profile: &Profile, begin: usize, end: usize, sigma: f64, band:
             at = 0.5 * (low + high);
         }
     }
-    Some(Toe { at, from: range[0].min(at), to: range[1].max(at) })
+    let found = Toe { at, from: range[0].min(at), to: range[1].max(at), undercut_mm: 0.0 };
+    Some(beyond_undercut(profile, found, sigma).unwrap_or(found))
+}
+
+/// A toe whose parabolas met at the inner side of an undercut, put to its outer side: where the surface comes back to the wall.
+fn beyond_undercut(profile: &Profile, toe: Toe, sigma: f64) -> Option<Toe> {
+    let beyond = profile.boundary(toe.at + UNDERCUT_MM + QUIET_MM);
+    let wall = profile.line(beyond, (beyond + profile.in_bins(UNDERCUT_WALL_MM)).min(profile.len()))?;
+    let (inside, quiet) = (profile.boundary(toe.at - UNDERCUT_MM), profile.in_bins(QUIET_MM));
+    let seen = UNDERCUT_SEEN_MM.max(3.0 * sigma);
+    let below = |i: usize| wall.at(profile.x(i)) - profile.heights[i];
+    // Two beside each other, so that no single bin is one.
+    let last = (inside..beyond).rev().find(|&i| below(i) > seen && i > 0 && below(i - 1) > seen)? + 1;
+    let depths = (inside..last).map(|i| (below(i), i)).filter(|d| d.0.is_finite());
+    let (deepest, bottom) = depths.max_by(|a, b| a.0.total_cmp(&b.0))?;
+    // A wall that bends down towards the weld comes back to nothing.
+    let comes_back = last + quiet <= beyond && deepest > 2.0 * seen;
+    let at = profile.edge(last);
+    // A bin tells the mean of its width: a bevel goes on beyond the middle of the lowest one.
+    let undercut_mm = deepest * (1.0 + profile.bin / (at - profile.x(bottom)));
+    (comes_back && at > toe.at).then(|| Toe { at, from: toe.from, to: toe.to.max(at + profile.bin), undercut_mm })
 }
 
 /// The bin from which the flank is looked at.
@@ -122,5 +151,34 @@ mod tests {
         let profile = Profile::new(-20.0, 0.25, heights);
         let found = toe(&profile, profile.boundary(-3.2), profile.boundary(3.6), 0.003, None).unwrap();
         assert!((found.at - 3.0).abs() < 0.3 && found.to < 3.6, "{found:?}");
+    }
+
+    #[test]
+    fn an_undercut_belongs_to_the_weld_and_a_dent_to_the_wall() {
+        let cap = |x: f64, end: f64| 1.2 * (1.0 - (x / end).powi(2)).max(0.0);
+        let profile = |height: &dyn Fn(f64) -> f64| {
+            let scatter = |i: usize| 0.003 * (((i * 7919) % 13) as f64 / 6.0 - 1.0);
+            Profile::new(-20.0, 0.25, (0..160).map(|i| height(-19.875 + 0.25 * i as f64) + scatter(i)).collect())
+        };
+        let of = |profile: &Profile| toe(profile, profile.boundary(-3.0), profile.boundary(3.4), 0.003, None).unwrap();
+        for wide in [0.8, 1.4, 2.0] {
+            // The groove lies within the toe at 4.
+            let inner = 4.0 - wide;
+            let undercut = |x: f64| {
+                let within = (x - inner) / wide;
+                let groove =
+                    if (0.0..1.0).contains(&within) { (std::f64::consts::PI * within).sin().powi(2) } else { 0.0 };
+                cap(x, inner) - 0.3 * groove
+            };
+            let found = of(&profile(&undercut));
+            assert!((found.at - 4.0).abs() < 0.45, "{wide}: {found:?}");
+        }
+        // A wall that bends down towards the weld, over a few millimetres.
+        for decay in [2.0, 6.0, 15.0] {
+            let dented =
+                |x: f64| if x < 3.0 { cap(x, 3.0) - 0.8 * (x + 20.0) / 23.0 } else { -0.8 * ((3.0 - x) / decay).exp() };
+            let found = of(&profile(&dented));
+            assert!((found.at - 3.0).abs() < 0.45, "{decay}: {found:?}");
+        }
     }
 }

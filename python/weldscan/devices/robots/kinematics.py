@@ -1,4 +1,5 @@
-"""Joints of a six-axis arm with a spherical wrist, and the flange that they hold: for the simulated controllers.
+"""Joints of a six-axis arm with a spherical wrist, and the flange that they hold: what the joints say of the pose, and
+how the simulated controllers move.
 
 Lengths and senses of rotation are those of a KUKA KR 210 R2700: at A2 = -90, A3 = 90 the upper arm stands upright and
 the forearm points ahead. The joints have no stops. Link by link, base_from_flange = Tz(foot) Rz(-A1) Tx(shoulder)

@@ -1,15 +1,17 @@
 //! What the walls' unevenness and noise are like: the scales that make the cells most likely.
 //!
 //! `-2 l` of [`super::border`] and what is known of walls beforehand ([`Prior`]) are made least over the logarithms of a wall's four
-//! scales: of each wall alone, which takes one shot, then of each wall beside the other one, for what waves on one wall alone may
-//! be a bow of the shot.
+//! scales, shot by shot: of each wall of one shot alone, then of each wall beside the other one, for what waves on one wall alone
+//! may be a bow of the shot. What shots share of the border tells next to nothing of the scales, so each has its own
+//! ([`super::stretch`]), and the work grows with the shots.
 //! The search is a simplex: the cost jumps a little where the number of shapes across changes, and no derivative sees that.
 //!
 //! Source: J. Nelder and R. Mead, Comput. J. 7 (1965) 308; the restricted likelihood as in [`super::border`].
 
 use super::border::{Border, Columns};
+use super::stretch::Stretch;
 use super::sweep::{Reduced, sweep};
-use super::wall::{Line, Scales, Wall};
+use super::wall::Scales;
 use crate::ground::threads;
 
 /// What is known of a wall's scales beforehand: the logarithm of each is normal, within bounds.
@@ -19,10 +21,13 @@ pub(crate) struct Prior {
     pub of: [[f64; 4]; 4],
 }
 
+/// Waves shorter than this part of a cell are the cell's own.
+const LEAST_CELLS: f64 = 0.5;
+
 impl Prior {
     /// Of walls in cells of this size along and across, seen over these lengths.
     pub fn of_walls(cell_mm: [f64; 2], seen_mm: [f64; 2]) -> Self {
-        let bounds = |k: usize, most: f64| [1.5 * cell_mm[k], most.min(4.0 * seen_mm[k]).max(3.0 * cell_mm[k])];
+        let bounds = |k: usize, most: f64| [LEAST_CELLS * cell_mm[k], most.min(4.0 * seen_mm[k]).max(3.0 * cell_mm[k])];
         let ([a, b], [c, d]) = (bounds(0, 400.0), bounds(1, 600.0));
         Self { of: [[0.01, 1.5, 2e-4, 0.5], [25.0, 0.9, a, b], [50.0, 0.9, c, d], [1.65, 1.2, 0.2, 200.0]] }
     }
@@ -44,51 +49,59 @@ impl Prior {
     }
 }
 
-/// A search ends where the corners of the simplex cost the same to this: a third of what one standard deviation costs.
-const CLOSE: f64 = 0.3;
-/// Sweeps of one search: from nothing, and from what is about known.
-const MOST_SWEEPS: [usize; 2] = [80, 40];
+/// A search ends where the corners of the simplex cost the same to this, or after so many sweeps: of a first one, that only shows
+/// where to begin; and of one that ends within a third of what one standard deviation costs.
+const ABOUT: (f64, usize) = (2.0, 60);
+const CLOSELY: (f64, usize) = (0.3, 60);
 /// First steps of the logarithms, and of a search that begins near its end.
 const STEPS: [f64; 4] = [0.8, 0.5, 0.5, 0.4];
 const SHORT: f64 = 0.4;
 
-/// The scales of a wall from its own cells.
-pub(crate) fn fit_alone(line: &Line, wall: &Wall, columns: &Columns, size: usize, prior: &Prior) -> Option<Scales> {
-    let cost = |logs: &[f64; 4]| {
-        let (scales, price) = prior.read(logs);
-        let reduced = sweep(line, wall, &scales, &[])?;
-        Some(Border::join(size, &[(&reduced, columns)])?.cost + price)
+/// The scales of both walls from some shots: begun at `near`, or with each wall of the first of them alone; then each beside the
+/// other one as it was begun with. `None` where the cells do not tell.
+pub(crate) fn fit(shots: &[Stretch], priors: [&Prior; 2], near: Option<[Scales; 2]>) -> Option<[Scales; 2]> {
+    let one = |shot: &Stretch, k: usize, scales: &Scales| sweep(&shot.line, &shot.walls[k], scales, &[]);
+    let join = |shot: &Stretch, walls: &[(&Reduced, &Columns)]| Some(Border::join(shot.columns.len(), walls)?.cost);
+    let both = |job: &(dyn Fn(usize) -> Option<Scales> + Sync)| -> Option<[Scales; 2]> {
+        let (first, second) = threads::install(|| rayon::join(|| job(0), || job(1)));
+        Some([first?, second?])
     };
-    search(prior.start(), STEPS, MOST_SWEEPS[0], &cost).map(|logs| prior.read(&logs).0)
-}
-
-/// The scales of both walls, each beside the other as it was begun with, on a thread of its own.
-pub(crate) fn fit(
-    line: &Line,
-    walls: [&Wall; 2],
-    columns: [&Columns; 2],
-    size: usize,
-    priors: [&Prior; 2],
-    near: [Scales; 2],
-) -> Option<[Scales; 2]> {
-    let swept = |k: usize, scales: &Scales| sweep(line, walls[k], scales, &[]);
-    let begun: [Reduced; 2] = [swept(0, &near[0])?, swept(1, &near[1])?];
-    let beside = |k: usize| {
+    let near = match near {
+        Some(near) => near,
+        None => both(&|k| {
+            let shot = shots.first()?;
+            let cost = |logs: &[f64; 4]| {
+                let (scales, price) = priors[k].read(logs);
+                Some(join(shot, &[(&one(shot, k, &scales)?, &shot.columns)])? + price)
+            };
+            search(priors[k].start(), STEPS, ABOUT, &cost).map(|logs| priors[k].read(&logs).0)
+        })?,
+    };
+    let begun: Vec<[Reduced; 2]> =
+        shots.iter().map(|shot| Some([one(shot, 0, &near[0])?, one(shot, 1, &near[1])?])).collect::<Option<_>>()?;
+    both(&|k| {
         let cost = |logs: &[f64; 4]| {
             let (scales, price) = priors[k].read(logs);
-            let mine = swept(k, &scales)?;
-            Some(Border::join(size, &[(&mine, columns[k]), (&begun[1 - k], columns[1 - k])])?.cost + price)
+            let mut sum = price;
+            for (shot, begun) in shots.iter().zip(&begun) {
+                let mine = one(shot, k, &scales)?;
+                sum += join(shot, &[(&mine, &shot.columns), (&begun[1 - k], &shot.columns)])?;
+            }
+            Some(sum)
         };
         let Scales { sd_mm, along_mm, across_mm, noise } = near[k];
         let start = [sd_mm, along_mm, across_mm, noise].map(f64::ln);
-        search(start, STEPS.map(|s| SHORT * s), MOST_SWEEPS[1], &cost).map(|logs| priors[k].read(&logs).0)
-    };
-    let (first, second) = threads::install(|| rayon::join(|| beside(0), || beside(1)));
-    Some([first?, second?])
+        search(start, STEPS.map(|s| SHORT * s), CLOSELY, &cost).map(|logs| priors[k].read(&logs).0)
+    })
 }
 
 /// The least cost by a simplex of five corners; `None` where the cost has no value at the start.
-fn search(start: [f64; 4], steps: [f64; 4], most: usize, cost: &impl Fn(&[f64; 4]) -> Option<f64>) -> Option<[f64; 4]> {
+fn search(
+    start: [f64; 4],
+    steps: [f64; 4],
+    (close, most): (f64, usize),
+    cost: &impl Fn(&[f64; 4]) -> Option<f64>,
+) -> Option<[f64; 4]> {
     let worth = |logs: &[f64; 4]| cost(logs).unwrap_or(f64::INFINITY);
     let mut corners: Vec<([f64; 4], f64)> = vec![(start, cost(&start)?)];
     for k in 0..4 {
@@ -99,7 +112,7 @@ fn search(start: [f64; 4], steps: [f64; 4], most: usize, cost: &impl Fn(&[f64; 4
     let mut sweeps = corners.len();
     while sweeps < most {
         corners.sort_by(|a, b| a.1.total_cmp(&b.1));
-        if corners[4].1 - corners[0].1 < CLOSE {
+        if corners[4].1 - corners[0].1 < close {
             break;
         }
         let middle: [f64; 4] = std::array::from_fn(|k| corners[..4].iter().map(|c| c.0[k]).sum::<f64>() / 4.0);
@@ -139,10 +152,10 @@ mod tests {
         let cost = |x: &[f64; 4]| {
             Some(50.0 * (x[0] + 0.5 * x[1] - 1.0).powi(2) + x[1] * x[1] + (x[2] - 2.0).powi(2) + 5.0 * x[3] * x[3])
         };
-        let found = search([0.0, 1.0, 0.0, 1.0], STEPS, 100, &cost).unwrap();
+        let found = search([0.0, 1.0, 0.0, 1.0], STEPS, (0.3, 100), &cost).unwrap();
         // Nearer than one standard deviation.
         assert!(cost(&found).unwrap() < 1.0, "{found:?}");
-        assert!(search([0.0; 4], STEPS, 100, &|_| None).is_none());
+        assert!(search([0.0; 4], STEPS, CLOSELY, &|_| None).is_none());
     }
 
     #[test]
@@ -150,6 +163,6 @@ mod tests {
         let prior = Prior::of_walls([5.0, 5.0], [60.0, 40.0]);
         let (scales, price) = prior.read(&[0.0, 20.0, 0.0, 20.0]);
         assert!((scales.sd_mm - 0.5).abs() < 1e-9 && (scales.noise - 200.0).abs() < 1e-9);
-        assert!((scales.along_mm - 240.0).abs() < 1e-9 && (scales.across_mm - 7.5).abs() < 1e-9 && price > 1e4);
+        assert!((scales.along_mm - 240.0).abs() < 1e-9 && (scales.across_mm - 2.5).abs() < 1e-9 && price > 1e4);
     }
 }

@@ -150,10 +150,8 @@ fn dense(case: &Case) -> (f64, DVector<f64>, DMatrix<f64>) {
 }
 
 fn both(case: &Case, prior: &Prior) -> Option<[Scales; 2]> {
-    let alone = |k: usize| fit_alone(&case.line, &case.walls[k], &case.columns[k], case.size, prior);
-    let near = [alone(0)?, alone(1)?];
     let (walls, columns) = ([&case.walls[0], &case.walls[1]], [&case.columns[0], &case.columns[1]]);
-    fit(&case.line, walls, columns, case.size, [prior, prior], near)
+    fit(&[Stretch::new(case.line, walls, columns, case.size)], [prior, prior], None)
 }
 
 #[test]
@@ -173,6 +171,24 @@ fn elimination_is_dense_kriging() {
             assert!(answer.of_unevenness[i] < answer.covariance[i * 5 + i]);
         }
     }
+}
+
+#[test]
+fn a_turned_border_costs_the_same_at_all_scales() {
+    let case = case(false);
+    let (walls, columns) = ([&case.walls[0], &case.walls[1]], [&case.columns[0], &case.columns[1]]);
+    let turned = Stretch::new(case.line, walls, columns, case.size);
+    assert!(turned.columns.len() < case.size, "the first shot's level and lean are those of all");
+    let costs = [0.5, 1.0, 2.0].map(|factor| {
+        let of = |walls: [&Wall; 2], columns: [&Columns; 2], size: usize| {
+            let scales = case.scales.map(|s| Scales { sd_mm: factor * s.sd_mm, ..s });
+            let reduced = [0, 1].map(|k| sweep(&case.line, walls[k], &scales[k], &[]).unwrap());
+            Border::join(size, &[(&reduced[0], columns[0]), (&reduced[1], columns[1])]).unwrap().cost
+        };
+        let mine = &turned.columns;
+        of([&turned.walls[0], &turned.walls[1]], [mine, mine], mine.len()) - of(walls, columns, case.size)
+    });
+    assert!(costs.iter().all(|c| (c - costs[0]).abs() < 0.05), "{costs:?}");
 }
 
 #[test]

@@ -5,7 +5,7 @@ use super::terms::Terms;
 use crate::error::{Error, Result};
 use crate::ground::threads;
 use crate::weld::kriging::{
-    Answer, Asked, Border, Cell, Columns as BorderColumns, Line, Prior, Reduced, Scales, Wall, fit, fit_alone, sweep,
+    Answer, Asked, Border, Cell, Columns as BorderColumns, Line, Prior, Reduced, Scales, Stretch, Wall, fit, sweep,
 };
 
 /// So many shots, that share as little of the seam as may be, tell what the walls are like: the others see the same waves.
@@ -96,24 +96,14 @@ impl Equations {
 
     /// What the walls are like: begun at `near`, or with each wall alone as the shot with the most cells has it.
     pub fn scales(&self, near: Option<[Scales; 2]>) -> Result<[Scales; 2]> {
-        let undetermined = || degenerate("the walls do not determine it");
-        let chosen = self.telling();
-        let size = self.terms.count();
-        let near = match near {
-            Some(near) => near,
-            None => {
-                let count = |shot: usize| self.walls.iter().flat_map(Wall::cells).filter(|c| c.shot == shot).count();
-                let most = (0..self.terms.shots()).max_by_key(|k| (count(*k), std::cmp::Reverse(*k))).unwrap_or(0);
-                let one = self.of_a_shot(most);
-                let alone =
-                    |k: usize| fit_alone(&one.line, &one.walls[k], &one.border[k], one.terms.count(), &self.priors[k]);
-                let (first, second) = threads::install(|| rayon::join(|| alone(0), || alone(1)));
-                first.zip(second).map(|(a, b)| [a, b]).ok_or_else(undetermined)?
-            }
-        };
-        let part = self.only(|_, cell| chosen.contains(&cell.shot));
-        let (walls, columns) = ([&part.walls[0], &part.walls[1]], [&part.border[0], &part.border[1]]);
-        fit(&part.line, walls, columns, size, [&self.priors[0], &self.priors[1]], near).ok_or_else(undetermined)
+        let mut shots: Vec<Stretch> = self.telling().into_iter().map(|shot| self.of_a_shot(shot).stretch()).collect();
+        shots.sort_by_key(|s| std::cmp::Reverse(s.count()));
+        fit(&shots, [&self.priors[0], &self.priors[1]], near)
+            .ok_or_else(|| degenerate("the walls do not determine it"))
+    }
+
+    fn stretch(&self) -> Stretch {
+        Stretch::new(self.line, self.walls.each_ref(), self.border.each_ref(), self.terms.count())
     }
 
     /// One shot on a line of its own.

@@ -8,7 +8,7 @@
 //!
 //! Source: J. Nelder and R. Mead, Comput. J. 7 (1965) 308; the restricted likelihood as in [`super::border`].
 
-use super::border::{Border, Columns};
+use super::border::Border;
 use super::stretch::Stretch;
 use super::sweep::{Reduced, sweep};
 use super::wall::Scales;
@@ -29,11 +29,12 @@ impl Prior {
     pub fn of_walls(cell_mm: [f64; 2], seen_mm: [f64; 2]) -> Self {
         let bounds = |k: usize, most: f64| [LEAST_CELLS * cell_mm[k], most.min(4.0 * seen_mm[k]).max(3.0 * cell_mm[k])];
         let ([a, b], [c, d]) = (bounds(0, 400.0), bounds(1, 600.0));
-        Self { of: [[0.01, 1.5, 2e-4, 0.5], [25.0, 0.9, a, b], [50.0, 0.9, c, d], [1.65, 1.2, 0.2, 200.0]] }
+        Self { of: [[0.01, 1.5, 2e-4, 0.5], [25.0, 0.9, a, b], [50.0, 0.9, c, d], [1.65, 1.2, 0.2, 30.0]] }
     }
 
-    fn start(&self) -> [f64; 4] {
-        self.of.map(|[median, _, least, most]| median.clamp(least, most).ln())
+    fn start(&self) -> Scales {
+        let [sd_mm, along_mm, across_mm, noise] = self.of.map(|[median, _, least, most]| median.clamp(least, most));
+        Scales { sd_mm, along_mm, across_mm, noise }
     }
 
     /// The scales of logarithms, and what they cost; beyond the bounds the nearest ones at a price that grows.
@@ -51,60 +52,108 @@ impl Prior {
 
 /// A search ends where the corners of the simplex cost the same to this, or after so many sweeps: of a first one, that only shows
 /// where to begin; and of one that ends within a third of what one standard deviation costs.
-const ABOUT: (f64, usize) = (2.0, 60);
-const CLOSELY: (f64, usize) = (0.3, 60);
-/// First steps of the logarithms, and of a search that begins near its end.
-const STEPS: [f64; 4] = [0.8, 0.5, 0.5, 0.4];
+const ABOUT: (f64, usize) = (2.0, 30);
+const CLOSELY: (f64, usize) = (0.3, 50);
+/// First steps of the logarithms of sd and lengths, and of a search that begins near its end.
+const STEPS: [f64; 3] = [0.8, 0.5, 0.5];
 const SHORT: f64 = 0.4;
+/// Steps of the golden section that finds the noise: to a hundredth of its logarithm.
+const SECTIONS: usize = 14;
 
 /// The scales of both walls from some shots: begun at `near`, or with each wall of the first of them alone; then each beside the
 /// other one as it was begun with. `None` where the cells do not tell.
 pub(crate) fn fit(shots: &[Stretch], priors: [&Prior; 2], near: Option<[Scales; 2]>) -> Option<[Scales; 2]> {
-    let one = |shot: &Stretch, k: usize, scales: &Scales| sweep(&shot.line, &shot.walls[k], scales, &[]);
-    let join = |shot: &Stretch, walls: &[(&Reduced, &Columns)]| Some(Border::join(shot.columns.len(), walls)?.cost);
     let both = |job: &(dyn Fn(usize) -> Option<Scales> + Sync)| -> Option<[Scales; 2]> {
         let (first, second) = threads::install(|| rayon::join(|| job(0), || job(1)));
         Some([first?, second?])
     };
     let near = match near {
         Some(near) => near,
-        None => both(&|k| {
-            let shot = shots.first()?;
-            let cost = |logs: &[f64; 4]| {
-                let (scales, price) = priors[k].read(logs);
-                Some(join(shot, &[(&one(shot, k, &scales)?, &shot.columns)])? + price)
-            };
-            search(priors[k].start(), STEPS, ABOUT, &cost).map(|logs| priors[k].read(&logs).0)
-        })?,
+        None => {
+            let first = [(shots.first()?, None)];
+            both(&|k| likeliest(&first, k, priors[k], priors[k].start(), STEPS, ABOUT))?
+        }
     };
-    let begun: Vec<[Reduced; 2]> =
-        shots.iter().map(|shot| Some([one(shot, 0, &near[0])?, one(shot, 1, &near[1])?])).collect::<Option<_>>()?;
+    let swept = |shot: &Stretch, k: usize| sweep(&shot.line, &shot.walls[k], &near[k], &[]);
     both(&|k| {
-        let cost = |logs: &[f64; 4]| {
-            let (scales, price) = priors[k].read(logs);
-            let mut sum = price;
-            for (shot, begun) in shots.iter().zip(&begun) {
-                let mine = one(shot, k, &scales)?;
-                sum += join(shot, &[(&mine, &shot.columns), (&begun[1 - k], &shot.columns)])?;
-            }
-            Some(sum)
-        };
-        let Scales { sd_mm, along_mm, across_mm, noise } = near[k];
-        let start = [sd_mm, along_mm, across_mm, noise].map(f64::ln);
-        search(start, STEPS.map(|s| SHORT * s), CLOSELY, &cost).map(|logs| priors[k].read(&logs).0)
+        let beside = shots.iter().map(|shot| Some((shot, Some(swept(shot, 1 - k)?)))).collect::<Option<Vec<_>>>()?;
+        likeliest(&beside, k, priors[k], near[k], STEPS.map(|s| SHORT * s), CLOSELY)
     })
 }
 
-/// The least cost by a simplex of five corners; `None` where the cost has no value at the start.
+/// The likeliest scales of wall k, from shots with what the other wall says of each, or without.
+///
+/// Sd and noise that grow together leave the walls' sweep as it is, but for a factor: so the noise is found for every ratio of
+/// the two, and the simplex has three corners to move, not four.
+fn likeliest(
+    shots: &[(&Stretch, Option<Reduced>)],
+    k: usize,
+    prior: &Prior,
+    near: Scales,
+    steps: [f64; 3],
+    effort: (f64, usize),
+) -> Option<Scales> {
+    let best_noise = |logs: &[f64; 3]| -> Option<(f64, [f64; 4])> {
+        let (scales, price) = prior.read(&[logs[0], logs[1], logs[2], 0.0]);
+        // The bounds of sd hold with its noise, below; here it is over the noise's root.
+        let scales = Scales { sd_mm: logs[0].exp(), noise: 1.0, ..scales };
+        if !(price.is_finite() && scales.sd_mm.is_finite()) {
+            return None;
+        }
+        let swept = shots.iter().map(|(shot, _)| sweep(&shot.line, &shot.walls[k], &scales, &[]));
+        let swept = swept.collect::<Option<Vec<Reduced>>>()?;
+        let cost = |log_noise: f64| {
+            let logs = [logs[0] + 0.5 * log_noise, logs[1], logs[2], log_noise];
+            let mut sum = prior.read(&logs).1;
+            for ((shot, beside), mine) in shots.iter().zip(&swept) {
+                let mine = mine.noisier(log_noise);
+                let walls = [Some(&mine), beside.as_ref()];
+                let walls: Vec<_> = walls.into_iter().flatten().map(|wall| (wall, &shot.columns)).collect();
+                sum += Border::join(shot.columns.len(), &walls)?.cost;
+            }
+            Some((sum, logs))
+        };
+        let [_, _, _, [_, _, least, most]] = prior.of;
+        golden([least.ln(), most.ln()], &cost)
+    };
+    let Scales { sd_mm, along_mm, across_mm, noise } = near;
+    let start = [(sd_mm / noise.sqrt()).ln(), along_mm.ln(), across_mm.ln()];
+    let found = search(start, steps, effort, &|logs| Some(best_noise(logs)?.0))?;
+    Some(prior.read(&best_noise(&found)?.1).0)
+}
+
+/// The least of a function with one bottom between two places, with what it says there.
+fn golden<T>([mut low, mut high]: [f64; 2], cost: &impl Fn(f64) -> Option<(f64, T)>) -> Option<(f64, T)> {
+    let part = (5_f64.sqrt() - 1.0) / 2.0;
+    let mut at = [high - part * (high - low), low + part * (high - low)];
+    let mut found = [cost(at[0])?, cost(at[1])?];
+    for _ in 0..SECTIONS {
+        if found[0].0 < found[1].0 {
+            (high, at[1]) = (at[1], at[0]);
+            at[0] = high - part * (high - low);
+            found.swap(0, 1);
+            found[0] = cost(at[0])?;
+        } else {
+            (low, at[0]) = (at[0], at[1]);
+            at[1] = low + part * (high - low);
+            found.swap(0, 1);
+            found[1] = cost(at[1])?;
+        }
+    }
+    let [first, second] = found;
+    Some(if first.0 < second.0 { first } else { second })
+}
+
+/// The least cost by a simplex of four corners; `None` where the cost has no value at the start.
 fn search(
-    start: [f64; 4],
-    steps: [f64; 4],
+    start: [f64; 3],
+    steps: [f64; 3],
     (close, most): (f64, usize),
-    cost: &impl Fn(&[f64; 4]) -> Option<f64>,
-) -> Option<[f64; 4]> {
-    let worth = |logs: &[f64; 4]| cost(logs).unwrap_or(f64::INFINITY);
-    let mut corners: Vec<([f64; 4], f64)> = vec![(start, cost(&start)?)];
-    for k in 0..4 {
+    cost: &impl Fn(&[f64; 3]) -> Option<f64>,
+) -> Option<[f64; 3]> {
+    let worth = |logs: &[f64; 3]| cost(logs).unwrap_or(f64::INFINITY);
+    let mut corners: Vec<([f64; 3], f64)> = vec![(start, cost(&start)?)];
+    for k in 0..3 {
         let mut corner = start;
         corner[k] += steps[k];
         corners.push((corner, worth(&corner)));
@@ -112,31 +161,31 @@ fn search(
     let mut sweeps = corners.len();
     while sweeps < most {
         corners.sort_by(|a, b| a.1.total_cmp(&b.1));
-        if corners[4].1 - corners[0].1 < close {
+        if corners[3].1 - corners[0].1 < close {
             break;
         }
-        let middle: [f64; 4] = std::array::from_fn(|k| corners[..4].iter().map(|c| c.0[k]).sum::<f64>() / 4.0);
-        let away = |far: f64| -> [f64; 4] { std::array::from_fn(|k| middle[k] + far * (middle[k] - corners[4].0[k])) };
-        let try_at = |logs: [f64; 4]| (logs, worth(&logs));
+        let middle: [f64; 3] = std::array::from_fn(|k| corners[..3].iter().map(|c| c.0[k]).sum::<f64>() / 3.0);
+        let away = |far: f64| -> [f64; 3] { std::array::from_fn(|k| middle[k] + far * (middle[k] - corners[3].0[k])) };
+        let try_at = |logs: [f64; 3]| (logs, worth(&logs));
         let mirrored = try_at(away(1.0));
         sweeps += 1;
         if mirrored.1 < corners[0].1 {
             let further = try_at(away(2.0));
             sweeps += 1;
-            corners[4] = if further.1 < mirrored.1 { further } else { mirrored };
-        } else if mirrored.1 < corners[3].1 {
-            corners[4] = mirrored;
+            corners[3] = if further.1 < mirrored.1 { further } else { mirrored };
+        } else if mirrored.1 < corners[2].1 {
+            corners[3] = mirrored;
         } else {
-            let nearer = try_at(away(if mirrored.1 < corners[4].1 { 0.5 } else { -0.5 }));
+            let nearer = try_at(away(if mirrored.1 < corners[3].1 { 0.5 } else { -0.5 }));
             sweeps += 1;
-            if nearer.1 < corners[4].1.min(mirrored.1) {
-                corners[4] = nearer;
+            if nearer.1 < corners[3].1.min(mirrored.1) {
+                corners[3] = nearer;
             } else {
                 let best = corners[0].0;
                 for corner in &mut corners[1..] {
                     *corner = try_at(std::array::from_fn(|k| 0.5 * (best[k] + corner.0[k])));
                 }
-                sweeps += 4;
+                sweeps += 3;
             }
         }
     }
@@ -149,20 +198,28 @@ mod tests {
 
     #[test]
     fn the_search_finds_the_bottom_of_a_narrow_valley() {
-        let cost = |x: &[f64; 4]| {
-            Some(50.0 * (x[0] + 0.5 * x[1] - 1.0).powi(2) + x[1] * x[1] + (x[2] - 2.0).powi(2) + 5.0 * x[3] * x[3])
+        let cost = |x: &[f64; 3]| {
+            Some(50.0 * (x[0] + 0.5 * x[1] - 1.0).powi(2) + x[1] * x[1] + (x[2] - 2.0).powi(2))
         };
-        let found = search([0.0, 1.0, 0.0, 1.0], STEPS, (0.3, 100), &cost).unwrap();
+        let found = search([0.0, 1.0, 0.0], STEPS, (0.3, 100), &cost).unwrap();
         // Nearer than one standard deviation.
         assert!(cost(&found).unwrap() < 1.0, "{found:?}");
-        assert!(search([0.0; 4], STEPS, CLOSELY, &|_| None).is_none());
+        assert!(search([0.0; 3], STEPS, CLOSELY, &|_| None).is_none());
+    }
+
+    #[test]
+    fn a_golden_section_ends_at_the_bottom() {
+        for bottom in [-1.5, 0.3, 5.0] {
+            let (_, at) = golden([-1.6, 5.3], &|x| Some(((x - bottom).powi(2), x))).unwrap();
+            assert!((at - bottom).abs() < 0.01, "{at} is not {bottom}");
+        }
     }
 
     #[test]
     fn scales_stay_within_their_bounds() {
         let prior = Prior::of_walls([5.0, 5.0], [60.0, 40.0]);
         let (scales, price) = prior.read(&[0.0, 20.0, 0.0, 20.0]);
-        assert!((scales.sd_mm - 0.5).abs() < 1e-9 && (scales.noise - 200.0).abs() < 1e-9);
+        assert!((scales.sd_mm - 0.5).abs() < 1e-9 && (scales.noise - 30.0).abs() < 1e-9);
         assert!((scales.along_mm - 240.0).abs() < 1e-9 && (scales.across_mm - 2.5).abs() < 1e-9 && price > 1e4);
     }
 }

@@ -1,4 +1,5 @@
-//! A shot by itself, as the search for the walls' scales sees it: its own line, and of the border what its cells tell.
+//! A shot by itself, as the search for the walls' scales sees it: its own line, some of its rows, and of the border what its cells
+//! tell.
 //!
 //! Over the few degrees that a shot sees, most combinations of the border's unknowns do not show: of 45, some 15 do. All have a
 //! prior of 1, so that turning them into the eigenvectors of what the cells say changes nothing, and those of no information may
@@ -12,6 +13,10 @@ use super::wall::{Cell, Line, Wall, Width};
 /// Information, in units of the prior's, below which the cells are silent.
 const SILENT: f64 = 1e-3;
 
+/// Of more rows than this some are left out, for the work grows with their cube: those kept stand further and further apart, from
+/// the seam on, so that short waves show between the first ones and long waves between all.
+const ROWS: usize = 9;
+
 /// Both walls of one shot.
 #[derive(Debug, Clone)]
 pub(crate) struct Stretch {
@@ -24,6 +29,7 @@ pub(crate) struct Stretch {
 impl Stretch {
     /// Of walls whose columns are sums of `size` unknowns.
     pub fn new(line: Line, walls: [&Wall; 2], columns: [&Columns; 2], size: usize) -> Self {
+        let thinned: [(Vec<f64>, Vec<bool>); 2] = walls.map(thinned);
         let whole: [Vec<f64>; 2] = std::array::from_fn(|k| whole_rows(walls[k], columns[k], size));
         let mut told = DMatrix::<f64>::zeros(size, size);
         for (wall, rows) in walls.iter().zip(&whole) {
@@ -40,15 +46,16 @@ impl Stretch {
         kept.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
         let width = Width { common: kept.len(), of_a_shot: 0, shots: 1 };
         let walls = std::array::from_fn(|k| {
-            let next = std::cell::Cell::new(0);
+            let (rows_mm, held) = &thinned[k];
+            let mut of_held = whole[k].chunks_exact(size).zip(held).filter(|(_, held)| **held).map(|(row, _)| row);
             let turned = |_: &Cell, out: &mut [f64]| {
-                let row = &whole[k][next.get() * size..][..size];
-                next.set(next.get() + 1);
+                let Some(row) = of_held.next() else { return };
                 for (slot, c) in out.iter_mut().zip(&kept) {
                     *slot = row.iter().zip(eigen.eigenvectors.column(*c).iter()).map(|(a, b)| a * b).sum();
                 }
             };
-            Wall::new(walls[k].cells().to_vec(), width, carrying_rows(walls[k]), turned)
+            let cells = walls[k].cells().iter().zip(held).filter(|(_, held)| **held).map(|(cell, _)| *cell).collect();
+            Wall::new(cells, width, rows_mm.clone(), turned)
         });
         Self { line, walls, columns: (0..kept.len()).map(|k| vec![k]).collect() }
     }
@@ -72,15 +79,22 @@ fn whole_rows(wall: &Wall, columns: &Columns, size: usize) -> Vec<f64> {
     whole
 }
 
-/// The rows that lie where there are cells: nothing is asked elsewhere.
-fn carrying_rows(wall: &Wall) -> Vec<f64> {
-    let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
-    for cell in wall.cells() {
-        (low, high) = (low.min(cell.across_mm), high.max(cell.across_mm));
-    }
-    let mut rows: Vec<f64> = wall.rows_mm().to_vec();
-    rows.sort_by(f64::total_cmp);
-    let apart = rows.windows(2).map(|w| w[1] - w[0]).fold(0.0, f64::max);
-    rows.retain(|r| (low - apart..=high + apart).contains(r));
-    rows
+/// The rows that carry a wall's unevenness, where there are cells, and whether each cell lies in one of them.
+fn thinned(wall: &Wall) -> (Vec<f64>, Vec<bool>) {
+    let rows = wall.rows_mm();
+    let nearest = |cell: &Cell| {
+        let off = |k: &usize| (rows[*k] - cell.across_mm).abs();
+        (0..rows.len()).min_by(|a, b| off(a).total_cmp(&off(b))).unwrap_or(0)
+    };
+    let row_of: Vec<usize> = wall.cells().iter().map(nearest).collect();
+    let mut used = row_of.clone();
+    used.sort_unstable();
+    used.dedup();
+    used.sort_by(|a, b| rows[*a].abs().total_cmp(&rows[*b].abs()));
+    // 0, 1, 2, 4, 6, 9, 12, 16, ...
+    let apart = |n: usize| if used.len() > ROWS { (n + 1) * (n + 1) / 4 } else { n };
+    let mut kept: Vec<usize> = (0..).map(apart).map_while(|n| used.get(n)).copied().collect();
+    kept.sort_unstable();
+    let held = row_of.iter().map(|row| kept.binary_search(row).is_ok()).collect();
+    (kept.iter().map(|k| rows[*k]).collect(), held)
 }

@@ -18,6 +18,8 @@ use crate::ground::stop::poll;
 pub(crate) struct Reduced {
     /// Columns of the wall's border.
     pub columns: usize,
+    /// Cells of the wall.
+    pub cells: usize,
     /// Information of the border's unknowns without their prior, columns squared; the upper triangle counts.
     pub information: Vec<f64>,
     pub right: Vec<f64>,
@@ -29,6 +31,25 @@ pub(crate) struct Reduced {
     pub slope: Vec<f64>,
     /// Covariance of what was asked, given the border; asked squared.
     pub covariance: Vec<f64>,
+}
+
+impl Reduced {
+    /// What it would be if all variances, of noise and unevenness, were larger by a factor. Without what was asked.
+    pub(super) fn noisier(&self, log_factor: f64) -> Self {
+        let over = (-log_factor).exp();
+        let times = |values: &[f64]| values.iter().map(|v| over * v).collect::<Vec<f64>>();
+        Self {
+            columns: self.columns,
+            cells: self.cells,
+            information: times(&self.information),
+            right: times(&self.right),
+            square: over * self.square,
+            log_det: self.log_det + self.cells as f64 * log_factor,
+            value: Vec::new(),
+            slope: Vec::new(),
+            covariance: Vec::new(),
+        }
+    }
 }
 
 /// Eliminates a wall; `None` where the numbers do not allow it.
@@ -118,6 +139,7 @@ pub(crate) fn sweep(line: &Line, wall: &Wall, scales: &Scales, asked: &[Asked]) 
     }
     Some(Reduced {
         columns: border,
+        cells: wall.count(),
         information,
         right: (0..border).map(|i| over * wall.right[i] - at(i, border)).collect(),
         square: over * wall.square - at(border, border),

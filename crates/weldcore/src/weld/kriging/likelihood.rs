@@ -19,17 +19,27 @@ use crate::ground::threads;
 pub(crate) struct Prior {
     /// Median, standard deviation of the logarithm, least, most: of sd, lengths along and across (mm), and noise.
     pub of: [[f64; 4]; 4],
+    /// The least product of both lengths.
+    pub least_mm2: f64,
 }
 
-/// Waves shorter than this part of a cell are the cell's own.
+/// Waves shorter than this part of a cell one way are the cell's own; and what is short both ways is noise: unevenness covers so
+/// many cells.
 const LEAST_CELLS: f64 = 0.5;
+const LEAST_AREA: f64 = 1.5;
+
+/// What it costs to be beyond a bound by a factor e.
+const STEEP: f64 = 100.0;
 
 impl Prior {
     /// Of walls in cells of this size along and across, seen over these lengths.
     pub fn of_walls(cell_mm: [f64; 2], seen_mm: [f64; 2]) -> Self {
         let bounds = |k: usize, most: f64| [LEAST_CELLS * cell_mm[k], most.min(4.0 * seen_mm[k]).max(3.0 * cell_mm[k])];
         let ([a, b], [c, d]) = (bounds(0, 400.0), bounds(1, 600.0));
-        Self { of: [[0.01, 1.5, 2e-4, 0.5], [25.0, 0.9, a, b], [50.0, 0.9, c, d], [1.65, 1.2, 0.2, 30.0]] }
+        Self {
+            of: [[0.01, 1.5, 2e-4, 0.5], [25.0, 0.9, a, b], [50.0, 0.9, c, d], [1.65, 1.2, 0.2, 30.0]],
+            least_mm2: LEAST_AREA * cell_mm[0] * cell_mm[1],
+        }
     }
 
     fn start(&self) -> Scales {
@@ -43,9 +53,10 @@ impl Prior {
         let [sd_mm, along_mm, across_mm, noise] = std::array::from_fn(|k| {
             let [median, sigma, least, most] = self.of[k];
             let held = logs[k].clamp(least.ln(), most.ln());
-            cost += ((held - median.ln()) / sigma).powi(2) + 100.0 * (logs[k] - held).powi(2);
+            cost += ((held - median.ln()) / sigma).powi(2) + STEEP * (logs[k] - held).powi(2);
             held.exp()
         });
+        cost += STEEP * (self.least_mm2 / (along_mm * across_mm)).ln().max(0.0).powi(2);
         (Scales { sd_mm, along_mm, across_mm, noise }, cost)
     }
 }
@@ -198,9 +209,7 @@ mod tests {
 
     #[test]
     fn the_search_finds_the_bottom_of_a_narrow_valley() {
-        let cost = |x: &[f64; 3]| {
-            Some(50.0 * (x[0] + 0.5 * x[1] - 1.0).powi(2) + x[1] * x[1] + (x[2] - 2.0).powi(2))
-        };
+        let cost = |x: &[f64; 3]| Some(50.0 * (x[0] + 0.5 * x[1] - 1.0).powi(2) + x[1] * x[1] + (x[2] - 2.0).powi(2));
         let found = search([0.0, 1.0, 0.0], STEPS, (0.3, 100), &cost).unwrap();
         // Nearer than one standard deviation.
         assert!(cost(&found).unwrap() < 1.0, "{found:?}");

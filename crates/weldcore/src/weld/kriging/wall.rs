@@ -93,7 +93,12 @@ pub(crate) struct Wall {
 
 impl Wall {
     /// A wall of these cells; `row_of` writes a cell's row of the border.
-    pub fn new(mut cells: Vec<Cell>, width: Width, rows_mm: Vec<f64>, mut row_of: impl FnMut(&Cell, &mut [f64])) -> Self {
+    pub fn new(
+        mut cells: Vec<Cell>,
+        width: Width,
+        rows_mm: Vec<f64>,
+        mut row_of: impl FnMut(&Cell, &mut [f64]),
+    ) -> Self {
         cells.sort_by_key(|c| c.column);
         let (n, total) = (width.common + width.of_a_shot, width.total());
         let mut rows = vec![0.0; cells.len() * n];

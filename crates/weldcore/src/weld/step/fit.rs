@@ -98,8 +98,7 @@ impl Equations {
     pub fn scales(&self, near: Option<[Scales; 2]>) -> Result<[Scales; 2]> {
         let mut shots: Vec<Stretch> = self.telling().into_iter().map(|shot| self.of_a_shot(shot).stretch()).collect();
         shots.sort_by_key(|s| std::cmp::Reverse(s.count()));
-        fit(&shots, [&self.priors[0], &self.priors[1]], near)
-            .ok_or_else(|| degenerate("the walls do not determine it"))
+        fit(&shots, [&self.priors[0], &self.priors[1]], near).ok_or_else(|| degenerate("the walls do not determine it"))
     }
 
     fn stretch(&self) -> Stretch {

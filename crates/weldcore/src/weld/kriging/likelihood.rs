@@ -68,6 +68,8 @@ const CLOSELY: (f64, usize) = (0.3, 50);
 /// First steps of the logarithms of sd and lengths, and of a search that begins near its end.
 const STEPS: [f64; 3] = [0.8, 0.5, 0.5];
 const SHORT: f64 = 0.4;
+/// How often each wall is looked at beside the other one.
+const ROUNDS: usize = 2;
 /// Steps of the golden section that finds the noise: to a hundredth of its logarithm.
 const SECTIONS: usize = 14;
 
@@ -85,10 +87,13 @@ pub(crate) fn fit(shots: &[Stretch], priors: [&Prior; 2], near: Option<[Scales; 
             both(&|k| likeliest(&first, k, priors[k], priors[k].start(), STEPS, ABOUT))?
         }
     };
-    let swept = |shot: &Stretch, k: usize| sweep(&shot.line, &shot.walls[k], &near[k], &[]);
-    both(&|k| {
-        let beside = shots.iter().map(|shot| Some((shot, Some(swept(shot, 1 - k)?)))).collect::<Option<Vec<_>>>()?;
-        likeliest(&beside, k, priors[k], near[k], STEPS.map(|s| SHORT * s), CLOSELY)
+    (0..ROUNDS).try_fold(near, |near, _| {
+        let swept = |shot: &Stretch, k: usize| sweep(&shot.line, &shot.walls[k], &near[k], &[]);
+        both(&|k| {
+            let beside =
+                shots.iter().map(|shot| Some((shot, Some(swept(shot, 1 - k)?)))).collect::<Option<Vec<_>>>()?;
+            likeliest(&beside, k, priors[k], near[k], STEPS.map(|s| SHORT * s), CLOSELY)
+        })
     })
 }
 

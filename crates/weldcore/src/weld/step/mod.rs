@@ -29,6 +29,7 @@ mod view;
 pub use profile::ProfileBin;
 pub use view::LabelledShot;
 
+use super::Course;
 use super::kriging::{Asked, Largest, Scales, largest};
 use crate::error::{Error, Result, require_count};
 use crate::ground::memory::require;
@@ -105,7 +106,7 @@ pub struct Step {
     pub largest: LargestStep,
     /// The profile in order along the seam.
     pub profile: Vec<ProfileBin>,
-    /// Covariance of the profile's steps, row by row; what is not known of the place along the seam is left out.
+    /// Covariance of the profile's steps, row by row.
     pub covariance_mm2: Vec<f64>,
     /// From which departure on a bin's walls do not run on to the cap as they run further away.
     pub departure_limit: f64,
@@ -186,41 +187,30 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
     // Walls too short to leave anything out are not told apart.
     let guard = Guard::of(&equations, near, rows_mm, reach_mm).unwrap_or_else(|_| Guard::none(bin_count, near));
     let (mut scales, mut solved) = (near, at_seam(&equations, &near, &bins, posed)?);
-    let mut found = largest_step(&solved.answer.value, &solved.answer.covariance);
-    let departure_limit = Guard::limit(found.as_ref().map_or(0.0, |f| f.band_factor));
+    let mut found = Seen::of(&solved, &bins, &views, &seam.course, known)?;
+    let departure_limit = Guard::limit(found.largest.band_factor);
     if guard.departures.iter().flatten().any(|z| z.abs() > departure_limit) {
         // What lies beside the cap must not say what is usual.
         scales = guard.scales;
         solved = at_seam(&equations, &scales, &bins, posed)?;
-        found = largest_step(&solved.answer.value, &solved.answer.covariance);
+        found = Seen::of(&solved, &bins, &views, &seam.course, known)?;
     }
-    let Some(largest) = found else {
-        return Err(Error::Degenerate { what: "step", reason: "its uncertainty is none".into() });
-    };
     let Solved { border, answer, terms, residuals } = &solved;
+    let Seen { covariance_mm2, place_mm, largest } = found;
 
     let course = seam.course;
     let n = bins.len();
-    let slopes = slopes(&bins, course.bins(), course.at_reading(course.bin_width()), &answer.value);
     let mut profile = Vec::with_capacity(n);
     for (k, &bin) in bins.iter().enumerate() {
-        let at = course.bin_middle(bin);
-        // The nearest shot's doubt about its own axis is one about the angle.
-        let nearest = (0..views.len()).min_by(|a, b| {
-            let apart = |v: usize| course.apart(at, views[v].middle).abs();
-            apart(*a).total_cmp(&apart(*b))
-        });
-        let aside = border.spread(&terms.aside_row(nearest.unwrap_or(0), at))[0].sqrt();
-        let place_mm = slopes[k].abs() * known.at.hypot(course.difference(aside));
-        let variance = answer.covariance[k * n + k];
-        let standard_mm = variance.sqrt().hypot(place_mm);
+        let (variance, of_place) = (covariance_mm2[k * n + k], place_mm[k].powi(2));
+        let standard_mm = variance.sqrt();
         profile.push(ProfileBin {
             along: course.bin_reading(bin),
             step_mm: answer.value[k],
             standard_mm,
-            fit_mm: (variance - answer.of_unevenness[k]).max(0.0).sqrt(),
+            fit_mm: (variance - of_place - answer.of_unevenness[k]).max(0.0).sqrt(),
             unevenness_mm: answer.of_unevenness[k].max(0.0).sqrt(),
-            place_mm,
+            place_mm: place_mm[k],
             band_mm: largest.band_factor * standard_mm,
             departure: guard.departures[bin].unwrap_or(f64::NAN),
         });
@@ -251,12 +241,11 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
         let [c, s] = rows.map(|r| told(&r));
         Wave { n, amplitude_mm: [c.0, s.0], standard_mm: [c.1, s.1], prior_mm }
     });
-    let mean_variance = answer.covariance.iter().sum::<f64>() / (n * n) as f64;
-    let of_place = profile.iter().map(|b| b.place_mm).sum::<f64>() / n as f64;
+    let mean_variance = covariance_mm2.iter().sum::<f64>() / (n * n) as f64;
     Ok(Step {
         mean_mm,
         median_mm,
-        seam_mean_mm: (answer.value.iter().sum::<f64>() / n as f64, mean_variance.max(0.0).sqrt().hypot(of_place)),
+        seam_mean_mm: (answer.value.iter().sum::<f64>() / n as f64, mean_variance.max(0.0).sqrt()),
         largest,
         coverage: course.bin_width() * n as f64,
         curvature_mm: told(&terms.radius_row()),
@@ -269,11 +258,51 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
         unevenness: scales.map(|s| Unevenness { sd_mm: s.sd_mm, reach_mm: [s.along_mm, s.across_mm], noise: s.noise }),
         residual_rms_mm: (residuals.iter().map(|r| r * r).sum::<f64>() / residuals.len() as f64).sqrt(),
         cells: residuals.len(),
-        covariance_mm2: answer.covariance.clone(),
+        covariance_mm2,
         departure_limit,
         profile,
         deviation_mm,
     })
+}
+
+/// What is uncertain of the profile.
+struct Seen {
+    covariance_mm2: Vec<f64>,
+    /// Of each bin, what is not known of its place along the seam makes of it.
+    place_mm: Vec<f64>,
+    largest: LargestStep,
+}
+
+impl Seen {
+    /// Adds to the walls' covariance what a shift along the seam does: of all bins together by what the caller knows, of a shot's
+    /// bins by what that shot's place leaves open.
+    fn of(solved: &Solved, bins: &[usize], views: &[View], course: &Course, known: &Known) -> Result<Self> {
+        let (n, value) = (bins.len(), &solved.answer.value);
+        let slopes = slopes(bins, course.bins(), course.at_reading(course.bin_width()), value);
+        let apart = |bin: usize, view: &View| course.apart(course.bin_middle(bin), view.middle).abs();
+        let nearest = |bin: &usize| {
+            let by_place = |a: &usize, b: &usize| apart(*bin, &views[*a]).total_cmp(&apart(*bin, &views[*b]));
+            (0..views.len()).min_by(by_place).unwrap_or(0)
+        };
+        let shots: Vec<usize> = bins.iter().map(nearest).collect();
+        let aside: Vec<f64> = (bins.iter().zip(&shots))
+            .map(|(bin, shot)| {
+                let row = solved.terms.aside_row(*shot, course.bin_middle(*bin));
+                course.difference(solved.border.spread(&row)[0].sqrt())
+            })
+            .collect();
+        let mut covariance_mm2 = solved.answer.covariance.clone();
+        for i in 0..n {
+            for j in 0..n {
+                let shared = if shots[i] == shots[j] { aside[i] * aside[j] } else { 0.0 };
+                covariance_mm2[i * n + j] += slopes[i] * slopes[j] * (known.at * known.at + shared);
+            }
+        }
+        let place_mm = (0..n).map(|k| slopes[k].abs() * known.at.hypot(aside[k])).collect();
+        let largest = largest_step(value, &covariance_mm2)
+            .ok_or_else(|| Error::Degenerate { what: "step", reason: "its uncertainty is none".into() })?;
+        Ok(Self { covariance_mm2, place_mm, largest })
+    }
 }
 
 /// The step at the middles of bins. Several shots turn about the axis: by what the walls found in a first pass are like.

@@ -28,6 +28,8 @@ pub(crate) struct Prior {
 const LEAST_CELLS: f64 = 0.5;
 const LEAST_AREA: f64 = 1.5;
 
+/// Of the median lengths, where a second start is: so short waves and long ones may both be likely, with a ridge between.
+const SHORTER: f64 = 0.3;
 /// What it costs to be beyond a bound by a factor e.
 const STEEP: f64 = 100.0;
 
@@ -42,9 +44,16 @@ impl Prior {
         }
     }
 
-    fn start(&self) -> Scales {
-        let [sd_mm, along_mm, across_mm, noise] = self.of.map(|[median, _, least, most]| median.clamp(least, most));
-        Scales { sd_mm, along_mm, across_mm, noise }
+    /// Where to begin: the medians, and waves shorter each way.
+    fn starts(&self) -> [Scales; 4] {
+        [[1.0, 1.0], [SHORTER, 1.0], [1.0, SHORTER], [SHORTER, SHORTER]].map(|parts| {
+            let part = [1.0, parts[0], parts[1], 1.0];
+            let [sd_mm, along_mm, across_mm, noise] = std::array::from_fn(|k| {
+                let [median, _, least, most] = self.of[k];
+                (part[k] * median).clamp(least, most)
+            });
+            Scales { sd_mm, along_mm, across_mm, noise }
+        })
     }
 
     /// The scales of logarithms, and what they cost; beyond the bounds the nearest ones at a price that grows.
@@ -63,11 +72,11 @@ impl Prior {
 
 /// A search ends where the corners of the simplex cost the same to this, or after so many sweeps: of a first one, that only shows
 /// where to begin; and of one that ends within a third of what one standard deviation costs.
-const ABOUT: (f64, usize) = (2.0, 30);
-const CLOSELY: (f64, usize) = (0.3, 50);
+const ABOUT: (f64, usize) = (1.0, 30);
+const CLOSELY: (f64, usize) = (0.2, 50);
 /// First steps of the logarithms of sd and lengths, and of a search that begins near its end.
 const STEPS: [f64; 3] = [0.8, 0.5, 0.5];
-const SHORT: f64 = 0.4;
+const SHORT: f64 = 0.6;
 /// How often each wall is looked at beside the other one.
 const ROUNDS: usize = 2;
 /// Steps of the golden section that finds the noise: to a hundredth of its logarithm.
@@ -84,7 +93,7 @@ pub(crate) fn fit(shots: &[Stretch], priors: [&Prior; 2], near: Option<[Scales; 
         Some(near) => near,
         None => {
             let first = [(shots.first()?, None)];
-            both(&|k| likeliest(&first, k, priors[k], priors[k].start(), STEPS, ABOUT))?
+            both(&|k| likeliest(&first, k, priors[k], &priors[k].starts(), STEPS, ABOUT))?
         }
     };
     (0..ROUNDS).try_fold(near, |near, _| {
@@ -92,7 +101,7 @@ pub(crate) fn fit(shots: &[Stretch], priors: [&Prior; 2], near: Option<[Scales; 
         both(&|k| {
             let beside =
                 shots.iter().map(|shot| Some((shot, Some(swept(shot, 1 - k)?)))).collect::<Option<Vec<_>>>()?;
-            likeliest(&beside, k, priors[k], near[k], STEPS.map(|s| SHORT * s), CLOSELY)
+            likeliest(&beside, k, priors[k], &[near[k]], STEPS.map(|s| SHORT * s), CLOSELY)
         })
     })
 }
@@ -105,7 +114,7 @@ fn likeliest(
     shots: &[(&Stretch, Option<Reduced>)],
     k: usize,
     prior: &Prior,
-    near: Scales,
+    starts: &[Scales],
     steps: [f64; 3],
     effort: (f64, usize),
 ) -> Option<Scales> {
@@ -132,9 +141,11 @@ fn likeliest(
         let [_, _, _, [_, _, least, most]] = prior.of;
         golden([least.ln(), most.ln()], &cost)
     };
-    let Scales { sd_mm, along_mm, across_mm, noise } = near;
-    let start = [(sd_mm / noise.sqrt()).ln(), along_mm.ln(), across_mm.ln()];
-    let found = search(start, steps, effort, &|logs| Some(best_noise(logs)?.0))?;
+    let worth = |logs: &[f64; 3]| Some(best_noise(logs)?.0);
+    let logs = |s: &Scales| [(s.sd_mm / s.noise.sqrt()).ln(), s.along_mm.ln(), s.across_mm.ln()];
+    let starts = starts.iter().filter_map(|s| Some((logs(s), if starts.len() > 1 { worth(&logs(s))? } else { 0.0 })));
+    let (start, _) = starts.min_by(|a, b| a.1.total_cmp(&b.1))?;
+    let found = search(start, steps, effort, &worth)?;
     Some(prior.read(&best_noise(&found)?.1).0)
 }
 

@@ -681,7 +681,10 @@ class WeldStep:
     def __getitem__(self, name: str, /) -> Any: ...
 
 def measure_step(
-    shots: Sequence[WeldShot], angle_sigma_rad: float = 0.0, base_from_scanner: Sequence[ArrayLike] | None = None
+    shots: Sequence[WeldShot],
+    angle_sigma_rad: float = 0.0,
+    base_from_scanner: Sequence[ArrayLike] | None = None,
+    calibration_modes: Sequence[tuple[Sequence[int] | NDArray[np.int64], ArrayLike]] | None = None,
 ) -> WeldStep: ...
 def wall_differences(
     points_mm: ArrayLike,

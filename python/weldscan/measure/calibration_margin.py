@@ -9,7 +9,8 @@ covariance of their unevenness, and x the row of h at the seam, the step's error
 
 C is the scanner's covariance where its file has one, and else that of a *usual good calibration* of such a scanner
 (`nominal_covariance`): inverse of the information that its poses of a board hold, the poses eliminated. The calibration
-that was really made may be worse; of one that nobody stated no better is supposed.
+that was really made may be worse; of one that nobody stated no better is supposed. The surfaces' step holds a stated one in its U
+(`calibration_unknowns`); the paper's histogram does not.
 
 Sources: GUM (JCGM 100:2008) 5.1 and its supplement 2 (JCGM 102:2011) 6.2 for the propagation; K.-R. Koch, Parameter
 Estimation (1999), 3.4 for the information of an adjustment.
@@ -28,7 +29,7 @@ from weldscan._weldcore import Scanner, whitened
 from weldscan.calibration.bundle import K3, PARAMETERS, BundleModel, Features, prior_sigmas, rows_of
 from weldscan.calibration.volume import point_jacobian
 from weldscan.geometry import rotation_of
-from weldscan.measure.part_views import PartView
+from weldscan.measure.part_views import PartView, wall_sample
 from weldscan.records.scanner import ScannerSpec
 from weldscan.result import Finding, Label, bar
 
@@ -50,8 +51,6 @@ NOMINAL = (
 # Axes that meet nearer or further than this many of the part's distances are nearly parallel: where they meet is then
 # no place that anybody works at.
 MEETING = 2.0
-# So many points of a wall of a view tell how the scanner's errors bend it: they are smooth over the image.
-POINTS_PER_WALL = 200
 DEPTH_STRIDE = 8
 # A wall of fewer is none.
 LEAST_POINTS = 30
@@ -317,21 +316,20 @@ def step_jacobians(
     rows, moves = [], []
     for view in views:
         shot = view.shot
-        labels = shot.labels.ravel()
-        walls = [np.flatnonzero(labels == wall) for wall in (Label.REFERENCE_WALL, Label.OTHER_WALL)]
+        sample, labels = wall_sample(shot), shot.labels.ravel()
+        walls = [sample[labels[sample] == wall] for wall in (Label.REFERENCE_WALL, Label.OTHER_WALL)]
         if min(map(len, walls)) < LEAST_POINTS:
             continue
         # The core's radial deviations are white once each wall is divided by its own covariance's root.
         white = []
-        for wall, is_other in zip(walls, (0.0, 1.0), strict=True):
-            at = wall[np.linspace(0, len(wall) - 1, min(len(wall), POINTS_PER_WALL)).astype(int)]
+        for at, is_other in zip(walls, (0.0, 1.0), strict=True):
             angle, along = shot.angle_rad.ravel()[at].astype(float), shot.axial_mm.ravel()[at].astype(float)
             normal = np.outer(np.cos(angle), shot.zero) + np.outer(np.sin(angle), np.cross(shot.axis, shot.zero))
             moved = np.einsum("ni,nij->nj", normal, point_jacobian(model, view.points_mm.reshape(-1, 3)[at], axis))
             cylinder = _cylinder(angle, along / shot.radius_mm)
             drawn = _shell(along, shot.radius_mm, wall_mm)[:, None]
             columns = [cylinder, is_other * cylinder, (1 - is_other) * drawn, is_other * drawn, moved]
-            noise = shot.noise_mm**2 * len(at) / len(wall)
+            noise = shot.noise_mm**2 * len(at) / np.count_nonzero(labels == labels[at[0]])
             places = np.stack([angle * shot.radius_mm, along], axis=1)
             white.append(whitened(places, np.concatenate(columns, axis=1), *unevenness.correlation(noise)))
         both = np.concatenate(white)

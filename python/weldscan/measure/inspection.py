@@ -21,7 +21,14 @@ from weldscan._weldcore import WeldShot, WeldStep, __version__, measure_step, pl
 from weldscan.calibration.hand_eye import point_uncertainty_mm, pose_sigma
 from weldscan.errors import GeometryError, InputError
 from weldscan.measure.calibrated_part import about_region, held_against_calibration, mostly_outside
-from weldscan.measure.calibration_margin import CalibrationMargin, Unevenness, calibration_above, calibration_margin
+from weldscan.measure.calibration_margin import (
+    CalibrationMargin,
+    Unevenness,
+    calibration_above,
+    calibration_margin,
+    stated_covariance,
+)
+from weldscan.measure.calibration_unknowns import calibration_unknowns
 from weldscan.measure.journal import Journal, SetPhaseError, ShotReading, took
 from weldscan.measure.observable_terms import seam_terms
 from weldscan.measure.paper_method import paper_step
@@ -240,7 +247,8 @@ class _Run:
             angle_sigma = float(np.sqrt(max(turn, 0.0) + pose_sigma(hand_eye)[1] ** 2))
         try:
             poses = [view.base_from_scanner for view in views] if self.session.has_robot else None
-            step = measure_step([view.shot for view in views], angle_sigma_rad=angle_sigma, base_from_scanner=poses)
+            modes = calibration_unknowns(self.stated, self.read.scanner, views, self.read.axis)
+            step = measure_step([view.shot for view in views], angle_sigma, poses, modes)
         except GeometryError as error:
             return _Measured(), noticed + Journal(left_out=tuple((view.name, str(error)) for view in views))
         edges = edge_profile(views)
@@ -257,15 +265,17 @@ class _Run:
             required,
             "views" if required is None else by,
         )
-        margin = calibration_margin(
-            self.session.scanner,
-            self.read.scanner,
-            views,
-            found.angle_deg,
-            self.part.wall_thickness,
-            Unevenness(step.residual_rms_mm, *step.correlation_mm),
-            self.read.axis,
-        )
+        margin: CalibrationMargin | None = None
+        if self.leaves_calibration_out:
+            margin = calibration_margin(
+                self.session.scanner,
+                self.read.scanner,
+                views,
+                found.angle_deg,
+                self.part.wall_thickness,
+                Unevenness(step.residual_rms_mm, *step.correlation_mm),
+                self.read.axis,
+            )
         noticed, t = noticed + Journal(seam.findings) + took("seam", t), time.perf_counter()
         deviations = step.deviation_mm
         cloud = PartCloud(
@@ -287,6 +297,16 @@ class _Run:
                 noticed + Journal(left_out=tuple((view.name, why) for view in views)),
             )
         return _Measured(replace(found, histogram=histogram), cloud, seam, margin, agreements), noticed
+
+    @property
+    def stated(self) -> Floats | None:
+        """The covariance of the scanner's parameters, where its file states it."""
+        return stated_covariance(self.session.scanner)
+
+    @property
+    def leaves_calibration_out(self) -> bool:
+        """Does U hold nothing of the scanner's calibration?"""
+        return self.stated is None or self.method == "paper"
 
     @property
     def required_deg(self) -> float | None:
@@ -399,7 +419,7 @@ class _Run:
             return []
         limit_mm = min(limits)
         found = [self.edges_above(limit_mm, step)]
-        if value_mm is not None and expanded_mm is not None:
+        if self.leaves_calibration_out and value_mm is not None and expanded_mm is not None:
             found.append(calibration_above(measured.calibration, limit_mm, abs(value_mm) + expanded_mm))
         return [said for said in found if said is not None]
 

@@ -1,6 +1,6 @@
 //! The step for Python: what `measure_step` returns.
 
-use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods};
+use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyUntypedArrayMethods};
 use pyo3::exceptions::PyKeyError;
 use pyo3::prelude::*;
 
@@ -8,7 +8,7 @@ use crate::error::Error;
 use crate::python::call::{compute, raise};
 use crate::python::convert::{float_matrix, transform};
 use crate::python::weld::WeldShot;
-use crate::weld::step::{self, Known, LabelledShot, ProfileBin, Step, Wave};
+use crate::weld::step::{self, Known, LabelledShot, Modes, ProfileBin, Step, Wave};
 
 /// A column of the profile: its name, and what it holds of a bin.
 type Column = (&'static str, fn(&ProfileBin) -> f64);
@@ -245,18 +245,22 @@ impl WeldStep {
 /// Measures the step of the other wall over the reference wall on all shots together.
 ///
 /// shots: a list of WeldShot. angle_sigma_rad: standard uncertainty of the angle about the axis (k = 1). base_from_scanner: a (4, 4)
-/// matrix per shot; without them the frames of the shots' seams are taken for one. Returns a WeldStep. Raises InputError where
-/// there is not one matrix per shot, GeometryError where the walls do not determine the step. Source:
+/// matrix per shot; without them the frames of the shots' seams are taken for one. calibration_modes: of every shot points, by their
+/// place in it, (n,) int64, and how far each mode of the scanner's covariance moves them along the surface's normal, (n, m) float64,
+/// mm: unknowns of unit variance, common to all shots. Returns a WeldStep. Raises InputError where there is not one matrix, or one
+/// set of modes, per shot, GeometryError where the walls do not determine the step. Source:
 /// `crates/weldcore/src/weld/step/mod.rs`.
 #[pyfunction]
-#[pyo3(signature = (shots, angle_sigma_rad=0.0, base_from_scanner=None))]
+#[pyo3(signature = (shots, angle_sigma_rad=0.0, base_from_scanner=None, calibration_modes=None))]
 fn measure_step(
     py: Python<'_>,
     shots: Vec<PyRef<'_, WeldShot>>,
     angle_sigma_rad: f64,
     base_from_scanner: Option<Vec<Bound<'_, PyAny>>>,
+    calibration_modes: Option<Vec<(Vec<usize>, Bound<'_, PyAny>)>>,
 ) -> PyResult<WeldStep> {
     const NAME: &str = "base_from_scanner";
+    const MODES: &str = "calibration_modes";
     let poses = match base_from_scanner {
         Some(given) if given.len() != shots.len() => {
             let (expected, got) = (format!("{} matrices, one per shot", shots.len()), given.len().to_string());
@@ -268,10 +272,26 @@ fn measure_step(
         }
         None => vec![None; shots.len()],
     };
+    let modes = match &calibration_modes {
+        Some(given) if given.len() != shots.len() => {
+            let (expected, got) = (format!("{} sets, one per shot", shots.len()), given.len().to_string());
+            return Err(raise(py, &Error::Shape { what: MODES, expected, got }));
+        }
+        Some(given) => given
+            .iter()
+            .map(|(points, rows)| {
+                let rows = float_matrix(MODES, rows)?;
+                Ok((points, rows.as_array().iter().copied().collect::<Vec<f64>>(), rows.shape()[1]))
+            })
+            .collect::<PyResult<Vec<_>>>()?,
+        None => Vec::new(),
+    };
     let views: Vec<LabelledShot> = shots
         .iter()
         .zip(poses)
-        .map(|(s, base_from_scanner)| LabelledShot {
+        .enumerate()
+        .map(|(k, (s, base_from_scanner))| LabelledShot {
+            modes: modes.get(k).map(|(points, rows, count)| Modes { points, deviation_mm: rows, count: *count }),
             unrolled: &s.0.unrolled,
             labels: &s.0.labels,
             seam: s.0.seam,

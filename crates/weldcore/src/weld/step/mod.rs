@@ -8,7 +8,7 @@
 //! - on the other wall: `ref(θ) + h(θ, s) + shot_k(θ, s) + drawn'(θ, s) + f'(θ, s) + e`,
 //!
 //! with Fourier terms `ref` and `h`, what shot k is displaced by (which moves both walls alike), what the weld drew each wall in by,
-//! all with priors ([`terms`]); and each wall's own unevenness f, a Gaussian process whose scales the cells themselves tell.
+//! what the scanner's calibration leaves open ([`bend`]), all with priors ([`terms`]); and each wall's own unevenness f, a Gaussian process whose scales the cells themselves tell.
 //! Both walls are kriged to the seam ([`crate::weld::kriging`]): the step is that of the surfaces there, waves and shrinkage
 //! included, with one covariance for all bins. A shot's turn about the axis is solved for in a second pass, where the walls
 //! found so far say what it changes.
@@ -17,6 +17,7 @@
 //!
 //! Sources: N. Cressie, Statistics for Spatial Data (1993), 3.4; GUM (JCGM 100:2008) 5.2.2; JCGM 101:2008, 7.
 
+mod bend;
 mod cells;
 mod fit;
 mod guard;
@@ -26,6 +27,7 @@ mod terms;
 mod tests;
 mod view;
 
+pub use bend::Modes;
 pub use profile::ProfileBin;
 pub use view::LabelledShot;
 
@@ -33,6 +35,7 @@ use super::Course;
 use super::kriging::{Asked, Largest, Scales, largest};
 use crate::error::{Error, Result, require_count};
 use crate::ground::memory::require;
+use bend::Bend;
 use cells::{Columns, gather};
 use fit::{Equations, Solved};
 use guard::Guard;
@@ -173,7 +176,13 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
     let gathered = gather(shots, &views, &columns)?;
     let thickness_mm = shots.iter().map(|s| s.thickness_mm).sum::<f64>() / shots.len() as f64;
     let posed = shots.iter().all(|s| s.base_from_scanner.is_some());
-    let terms = Terms::new(seam.course, thickness_mm, views.iter().map(|v| v.middle).collect(), posed);
+    let bends = shots.iter().zip(&views).map(|(shot, view)| Bend::of(shot, view)).collect::<Result<Option<Vec<Bend>>>>()?;
+    let bends = bends.unwrap_or_default();
+    if bends.iter().any(|b| b.count() != bends[0].count()) {
+        let (expected, got) = ("the same modes in every shot".into(), "different numbers".into());
+        return Err(Error::Shape { what: "calibration modes", expected, got });
+    }
+    let terms = Terms::new(seam.course, thickness_mm, views.iter().map(|v| v.middle).collect(), posed, bends);
     let equations = Equations::of(columns, &gathered, terms);
     let (rows_mm, reach_mm) =
         (gathered.walls.each_ref().map(|w| w.row_mm), gathered.walls.each_ref().map(|w| w.reach_mm));

@@ -9,10 +9,12 @@
 //! | what the weld drew a wall in by, n = 0; n = 1, 2 | each wall | 0.2 mm; 0.05 mm |
 //! | radius, place and lean of a shot | both walls | one shot, or no poses: 5 mm, 20 mrad; several: 0.1 mm, 0.5 mm, 2 mrad, a robot's |
 //! | turn of a shot about the axis | both walls | 0.5 mm of place |
+//! | modes of the scanner's calibration | both walls | 1, as its covariance has them ([`super::bend`]) |
 //!
 //! All are linear: what an offset does in second order has the shape of n = 0 and 2. A wall's column is the sum of unknowns
 //! that it has no way to tell apart ([`Terms::columns`]).
 
+use super::bend::Bend;
 use crate::weld::kriging::{self, Cell, Width};
 use crate::weld::seam::Course;
 use crate::weld::sections::shell_term;
@@ -32,7 +34,7 @@ const LEAN: usize = 3;
 const STEP_ROUND: usize = 5;
 const REFERENCE_ROUND: usize = STEP_ROUND + ROUND;
 const SHELLS: usize = REFERENCE_ROUND + ROUND;
-const SHOTS: usize = SHELLS + 2 * SHELL;
+const MODES: usize = SHELLS + 2 * SHELL;
 
 const LEAST_RADIUS_MM: f64 = 1.0;
 const LEAST_OFFSET_MM: f64 = 3.0;
@@ -59,6 +61,8 @@ pub(super) struct Terms {
     /// Fourier terms of the reference wall and of the step so far, n = 1 to 12: what a turn of a shot changes. Without them a shot
     /// does not turn.
     turned: Option<[Vec<[f64; 2]>; 2]>,
+    /// What the scanner's calibration leaves open: of every shot, or of none.
+    bends: Vec<Bend>,
 }
 
 /// A Fourier series' slope.
@@ -72,7 +76,7 @@ fn slope(series: &[[f64; 2]], at: f64) -> f64 {
 
 impl Terms {
     /// Of shots whose stretches have these middles; `posed` where their places are known.
-    pub fn new(course: Course, thickness_mm: f64, middles: Vec<f64>, posed: bool) -> Self {
+    pub fn new(course: Course, thickness_mm: f64, middles: Vec<f64>, posed: bool, bends: Vec<Bend>) -> Self {
         let diameter = 2.0 * course.radius_mm();
         Self {
             course,
@@ -83,6 +87,7 @@ impl Terms {
             offset_sigma_mm: LEAST_OFFSET_MM.max(thickness_mm),
             round_sigma_mm: LEAST_ROUND_MM.max(diameter / 400.0),
             turned: None,
+            bends,
         }
     }
 
@@ -110,16 +115,22 @@ impl Terms {
 
     /// Of one of the shots alone.
     pub fn of_shot(&self, shot: usize) -> Self {
-        Self { middles: vec![self.middles[shot]], ..self.clone() }
+        let bends = self.bends.get(shot).cloned().into_iter().collect();
+        Self { middles: vec![self.middles[shot]], bends, ..self.clone() }
     }
 
     fn of_a_shot(&self) -> usize {
         OF_A_SHOT + usize::from(self.turned.is_some())
     }
 
+    /// How many modes the scanner's calibration has.
+    fn modes(&self) -> usize {
+        self.bends.first().map_or(0, Bend::count)
+    }
+
     /// Where the unknowns of a shot begin.
     fn shot_at(&self, shot: usize) -> usize {
-        SHOTS + self.of_a_shot() * shot
+        MODES + self.modes() + self.of_a_shot() * shot
     }
 
     /// How many unknowns there are.
@@ -129,7 +140,7 @@ impl Terms {
 
     /// Of the reference wall (`other` false) and of the other one.
     pub fn width(&self, other: bool) -> Width {
-        let common = if other { STEP_ROUND + ROUND + SHELL } else { ROUND + SHELL };
+        let common = self.modes() + if other { STEP_ROUND + ROUND + SHELL } else { ROUND + SHELL };
         Width { common, of_a_shot: self.of_a_shot(), shots: self.middles.len() }
     }
 
@@ -144,7 +155,7 @@ impl Terms {
         }
         let shell = SHELLS + SHELL * usize::from(other);
         columns.extend((shell..shell + SHELL).map(|k| vec![k]));
-        columns.extend((SHOTS..self.count()).map(|k| vec![k]));
+        columns.extend((MODES..self.count()).map(|k| vec![k]));
         columns
     }
 
@@ -174,7 +185,11 @@ impl Terms {
         }
         self.round(at, &mut out[next..next + ROUND]);
         self.shell(at, z, &mut out[next + ROUND..next + ROUND + SHELL]);
-        self.shot(other, cell.shot, at, z, &mut out[next + ROUND + SHELL..]);
+        let (modes, shot) = out[next + ROUND + SHELL..].split_at_mut(self.modes());
+        if let Some(bend) = self.bends.get(cell.shot) {
+            bend.at(self.course.apart(at, bend.middle()), z, modes);
+        }
+        self.shot(other, cell.shot, at, z, shot);
     }
 
     /// n = 0 and 1 of the step, and its lean.
@@ -202,7 +217,7 @@ impl Terms {
         out.fill(0.0);
         self.step(at, 0.0, out);
         self.round(at, &mut out[STEP_ROUND..REFERENCE_ROUND]);
-        self.shell(at, 0.0, &mut out[SHELLS + SHELL..SHOTS]);
+        self.shell(at, 0.0, &mut out[SHELLS + SHELL..MODES]);
         let mut drawn = [0.0; SHELL];
         self.shell(at, 0.0, &mut drawn);
         out[SHELLS..SHELLS + SHELL].iter_mut().zip(drawn).for_each(|(o, d)| *o = -d);

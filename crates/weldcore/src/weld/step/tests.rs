@@ -17,6 +17,7 @@ fn shot(s: &Segmentation) -> LabelledShot<'_> {
         labels: &s.labels,
         seam: s.seam,
         thickness_mm: s.thickness_mm,
+        modes: None,
         base_from_scanner: None,
     }
 }

@@ -1,5 +1,6 @@
 //! The shots of one seam in one frame: a common axis and zero mark, and where each shot's points lie about them.
 
+use super::bend::Modes;
 use crate::error::{Error, Result, require_count, require_positive};
 use crate::ground::threads;
 use crate::ground::transform::{Transform, Vec3};
@@ -26,6 +27,8 @@ pub struct LabelledShot<'a> {
     pub thickness_mm: f64,
     /// Where the scanner stood; `None` of all shots: their seams' frames are taken for one.
     pub base_from_scanner: Option<Transform>,
+    /// What the scanner's calibration leaves open: of all shots, or of none.
+    pub modes: Option<Modes<'a>>,
 }
 
 pub(super) fn is_wall(label: u8) -> Option<bool> {

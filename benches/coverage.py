@@ -30,6 +30,8 @@ TOE_MM, REACH_MM = 6.0, 80.0
 """Where the walls begin beside the seam, and where the view ends."""
 SPACING_MM = 0.9
 """Of points."""
+DISTANCE_MM = 420.0
+"""From the scanner to the weld."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,8 @@ class Scenario:
     place_mm: float = 0.2
     place_rad: float = 0.0005
     """The robot's error, each way."""
+    board: float = 0.0
+    """The scanner is drawn from the covariance of 15 poses of a board that fills this share of the field; 0: it is exact."""
 
 
 def both(*waves: tuple[float, float, float]) -> tuple:
@@ -83,6 +87,17 @@ SCENARIOS = (
     Scenario("walls unlike", waves=(((0.005, 8, 8),), ((0.03, 40, 60),))),
     Scenario("reference even", waves=((), ((0.02, 15, 40),))),
     Scenario("waves of two scales", waves=both((0.01, 8, 8), (0.03, 40, 100))),
+    Scenario("scanner of 15 poses", board=1.0),
+    Scenario("scanner of 15 poses, waves 8x8", board=1.0, waves=both((0.01, 8, 8))),
+    Scenario("scanner of 15 poses, two shots", board=1.0, shots=2, waves=both((0.01, 15, 40))),
+    Scenario("scanner of 15 central poses", board=0.5),
+    Scenario(
+        "everything",
+        board=1.0,
+        oval_mm=0.5,
+        shrinkage_mm=(0.1, 0.05),
+        waves=both((0.02, 15, 40)),
+    ),
     Scenario("pipe 25", diameter_mm=25.0, thickness_mm=3.0, waves=both((0.005, 8, 20))),
     Scenario("pipe 57", diameter_mm=57.0, thickness_mm=4.0, waves=both((0.01, 10, 30))),
     Scenario("pipe 114", diameter_mm=114.3, thickness_mm=6.0, waves=both((0.01, 15, 40)), shots=2),
@@ -147,10 +162,27 @@ def _weld(scenario: Scenario, random: np.random.Generator):
     )
 
 
+def _seen_by(scanner, drawn, points: np.ndarray) -> np.ndarray:
+    """Where the scanner as it is stated puts what the one that was there saw: the same pixel, the same projector column."""
+
+    def features(of, at: np.ndarray) -> np.ndarray:
+        return np.column_stack([of.camera.project(at), of.project_to_projector(at)[:, :1]])
+
+    seen, found = features(drawn, points), points.copy()
+    for _ in range(4):
+        off = features(scanner, found) - seen
+        steps = [(features(scanner, found + h) - features(scanner, found - h)) / 0.02 for h in 0.01 * np.eye(3)]
+        found -= np.linalg.solve(np.stack(steps, axis=2), off[:, :, None])[:, :, 0]
+    return found
+
+
 def run(job: tuple[int, int]) -> dict:
     """One run of a scenario."""
     import weldscan
     from weldscan._weldcore import SeamCourse, SeamFrame
+    from weldscan.calibration.modes import covariance_root, deviation_modes, drawn_scanner
+    from weldscan.measure.calibration_margin import nominal_covariance
+    from weldscan.simulated.placing import make_scanner
     from weldscan.simulated.scenes import surface_of
     from weldscan.weld import label_weld, measure_step
 
@@ -169,7 +201,11 @@ def run(job: tuple[int, int]) -> dict:
     reach = min(REACH_MM, 20.0 + radius)
     toe = min(TOE_MM, 0.2 * reach)
     spacing = min(SPACING_MM, radius / 25)
-    shots, poses = [], []
+    scanner, root = make_scanner(), None
+    if scenario.board:
+        root = covariance_root(nominal_covariance(scanner, DISTANCE_MM, fills=scenario.board))
+        drawn = drawn_scanner(scanner, root @ random.standard_normal(root.shape[1]))
+    shots, poses, modes = [], [], []
     for k in range(scenario.shots):
         middle = first + k * apart
         x = np.arange(-half * radius, half * radius, spacing) / radius
@@ -180,8 +216,10 @@ def run(job: tuple[int, int]) -> dict:
         across = np.where(np.abs(across) < toe, np.sign(across) * toe, across)
         height = surface.height(along, across) + random.normal(0.0, scenario.noise_mm, along.shape)
         points = np.stack([(radius + height) * np.cos(along), (radius + height) * np.sin(along), across], axis=1)
+        out = np.array([math.cos(middle), math.sin(middle), 0.0])
         base_from_scanner = np.eye(4)
-        base_from_scanner[:3, 3] = 0.3 * radius * math.cos(middle), 0.3 * radius * math.sin(middle), 400.0
+        base_from_scanner[:3, :3] = np.column_stack([[0.0, 0.0, 1.0], np.cross(-out, [0.0, 0.0, 1.0]), -out])
+        base_from_scanner[:3, 3] = (radius + DISTANCE_MM) * out
         # What the robot says is a little off: the cloud moves in base by that.
         lever = np.eye(4)
         lever[:3, 3] = radius * math.cos(middle), radius * math.sin(middle), 0.0
@@ -191,11 +229,17 @@ def run(job: tuple[int, int]) -> dict:
         in_base = points @ off[:3, :3].T + off[:3, 3]
         in_scanner = (in_base - base_from_scanner[:3, 3]) @ base_from_scanner[:3, :3]
         labels = np.where(across < 0, 1, 2).astype(np.uint8)
-        seam = SeamFrame(-base_from_scanner[:3, 3], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], SeamCourse(radius))
+        if root is not None:
+            normal = np.stack([np.cos(along), np.sin(along), 0 * along], axis=1) @ base_from_scanner[:3, :3]
+            some = np.linspace(0, len(labels) - 1, 400).astype(int)
+            modes.append((some, deviation_modes(scanner, root, in_scanner[some], normal[some])))
+            in_scanner = _seen_by(scanner, drawn, in_scanner)
+        turn = base_from_scanner[:3, :3].T
+        seam = SeamFrame(turn @ -base_from_scanner[:3, 3], turn[:, 2], turn[:, 0], SeamCourse(radius))
         shots.append(label_weld(in_scanner, labels, seam, weld.thickness_mm))
         poses.append(base_from_scanner)
     began = time.perf_counter()
-    step = measure_step(shots, base_from_scanner=poses)
+    step = measure_step(shots, base_from_scanner=poses, calibration_modes=modes or None)
     seconds = time.perf_counter() - began
     at = np.radians(step.column("angle_deg"))
     edges = surface.edges(at)

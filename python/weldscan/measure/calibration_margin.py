@@ -218,7 +218,7 @@ def working_distance_mm(scanner: Scanner, part_mm: float) -> float:
     return met if lamp > 0 and part_mm / MEETING < met < part_mm * MEETING else part_mm
 
 
-def nominal_covariance(scanner: Scanner, distance_mm: float) -> Floats:
+def nominal_covariance(scanner: Scanner, distance_mm: float, fills: float = 1.0) -> Floats:
     """Covariance of the parameters that a usual good calibration of this scanner leaves.
 
     Free are both focal lengths, principal points, k1 k2 p1 p2 of both devices and camera_from_projector.
@@ -226,6 +226,7 @@ def nominal_covariance(scanner: Scanner, distance_mm: float) -> Floats:
     Args:
         scanner: the scanner.
         distance_mm: where the boards stood, from the camera.
+        fills: share of the field that the board fills, each way.
 
     Returns:
         (24, 24), of `bundle.PARAMETERS`.
@@ -234,7 +235,7 @@ def nominal_covariance(scanner: Scanner, distance_mm: float) -> Floats:
     long, short = (0, 1) if half[0] >= half[1] else (1, 0)
     corners = np.zeros((CORNERS[0] * CORNERS[1], 3))
     grid = np.meshgrid(*(np.linspace(-1, 1, n) * (1 - 1 / n) for n in CORNERS), indexing="ij")
-    corners[:, long], corners[:, short] = grid[0].ravel() * half[long], grid[1].ravel() * half[short]
+    corners[:, long], corners[:, short] = (fills * g.ravel() * half[k] for g, k in zip(grid, (long, short), strict=True))
     tilts = [(near, tilt) for near in DEPTHS for tilt in TILTS_DEG]
     turns = np.array([rotation_of(np.radians([*tilt, 0.0])) for _, tilt in tilts])
     # Nearer boards are moved along the ray to the field's middle.

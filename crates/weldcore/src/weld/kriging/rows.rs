@@ -97,41 +97,35 @@ pub(super) fn add_cell(
     }
 }
 
-/// The lower Cholesky factor of a symmetric matrix, in place of its lower triangle, and the logarithm of its determinant; `None`
-/// where it is not positive definite.
+/// The lower Cholesky factor of a symmetric matrix of which the lower triangle is given, in its place (the upper triangle becomes
+/// its transpose), and the logarithm of its determinant; `None` where it is not positive definite.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
 pub(super) fn cholesky(matrix: &mut [f64], size: usize) -> Option<f64> {
+    for i in 0..size {
+        for j in 0..i {
+            matrix[j * size + i] = matrix[i * size + j];
+        }
+    }
+    // Row by row of the upper factor: each is what is left of its own after multiples of those above.
     let mut log_det = 0.0;
     for i in 0..size {
-        for j in 0..=i {
-            let dot = dot(&matrix[i * size..i * size + j], &matrix[j * size..j * size + j]);
-            let value = matrix[i * size + j] - dot;
-            if i == j {
-                if !(value > 0.0 && value.is_finite()) {
-                    return None;
-                }
-                log_det += value.ln();
-                matrix[i * size + i] = value.sqrt();
-            } else {
-                matrix[i * size + j] = value / matrix[j * size + j];
-            }
+        let (done, rest) = matrix.split_at_mut(i * size);
+        let out = &mut rest[i..size];
+        add_rows(out, done, size, i, |k| -done[k * size + i]);
+        let pivot = out[0];
+        if !(pivot > 0.0 && pivot.is_finite()) {
+            return None;
+        }
+        log_det += pivot.ln();
+        let over = 1.0 / pivot.sqrt();
+        out.iter_mut().for_each(|v| *v *= over);
+    }
+    for i in 0..size {
+        for j in 0..i {
+            matrix[i * size + j] = matrix[j * size + i];
         }
     }
     Some(log_det)
-}
-
-/// A scalar product in four interleaved sums.
-#[inline(always)]
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let mut sums = [0.0; 4];
-    let (fours, rest) = (a.chunks_exact(4), a.chunks_exact(4).remainder());
-    for (x, y) in fours.zip(b.chunks_exact(4)) {
-        for k in 0..4 {
-            sums[k] += x[k] * y[k];
-        }
-    }
-    let tail: f64 = rest.iter().zip(&b[a.len() - rest.len()..]).map(|(x, y)| x * y).sum();
-    (sums[0] + sums[1]) + (sums[2] + sums[3]) + tail
 }
 
 #[cfg(test)]

@@ -28,7 +28,8 @@ pub(crate) struct Border {
     lower: Vec<f64>,
     /// The unknowns, in units of their prior.
     pub estimate: Vec<f64>,
-    /// `-2 l`, but for a constant.
+    /// `-2 l`, but for a constant: what [`Scaled::cost`] finds by a shorter way.
+    #[cfg_attr(not(test), expect(dead_code))]
     pub cost: f64,
 }
 
@@ -118,5 +119,47 @@ impl Border {
         let mut covariance = vec![0.0; asked * asked];
         add_gram(&mut covariance, &turned, asked);
         covariance
+    }
+}
+
+/// A wall whose variances, of noise and unevenness, are all larger by a factor that is still to be found, beside another wall or none;
+/// both have the border's unknowns for columns.
+pub(super) struct Scaled<'a> {
+    wall: &'a Reduced,
+    beside: Option<&'a Reduced>,
+    /// What the equations are built in.
+    lower: Vec<f64>,
+    right: Vec<f64>,
+}
+
+impl<'a> Scaled<'a> {
+    pub fn new(wall: &'a Reduced, beside: Option<&'a Reduced>) -> Self {
+        Self { wall, beside, lower: vec![0.0; wall.columns * wall.columns], right: vec![0.0; wall.columns] }
+    }
+
+    /// What [`Border::join`] says it costs, with this factor.
+    pub fn cost(&mut self, log_factor: f64) -> Option<f64> {
+        let (size, over) = (self.wall.columns, (-log_factor).exp());
+        let mut cost = over * self.wall.square + self.wall.log_det + self.wall.cells as f64 * log_factor;
+        for i in 0..size {
+            for j in i..size {
+                self.lower[j * size + i] = over * self.wall.information[i * size + j];
+            }
+            self.lower[i * size + i] += 1.0;
+            self.right[i] = over * self.wall.right[i];
+        }
+        if let Some(beside) = self.beside {
+            for i in 0..size {
+                for j in i..size {
+                    self.lower[j * size + i] += beside.information[i * size + j];
+                }
+                self.right[i] += beside.right[i];
+            }
+            cost += beside.square + beside.log_det;
+        }
+        cost += cholesky(&mut self.lower, size)?;
+        forward(&self.lower, size, &mut self.right, 1);
+        cost -= self.right.iter().map(|v| v * v).sum::<f64>();
+        cost.is_finite().then_some(cost)
     }
 }

@@ -8,7 +8,7 @@
 //!
 //! Source: J. Nelder and R. Mead, Comput. J. 7 (1965) 308; the restricted likelihood as in [`super::border`].
 
-use super::border::Border;
+use super::border::Scaled;
 use super::stretch::Stretch;
 use super::sweep::{Reduced, sweep};
 use super::wall::Scales;
@@ -73,37 +73,34 @@ impl Prior {
 /// A search ends where the corners of the simplex cost the same to this, or after so many sweeps: of a first one, that only shows
 /// where to begin; and of one that ends within a third of what one standard deviation costs.
 const ABOUT: (f64, usize) = (1.0, 30);
-const CLOSELY: (f64, usize) = (0.2, 50);
+const CLOSELY: (f64, usize) = (0.3, 40);
 /// First steps of the logarithms of sd and lengths, and of a search that begins near its end.
 const STEPS: [f64; 3] = [0.8, 0.5, 0.5];
 const SHORT: f64 = 0.6;
-/// How often each wall is looked at beside the other one.
-const ROUNDS: usize = 2;
 /// Steps of the golden section that finds the noise: to a hundredth of its logarithm.
 const SECTIONS: usize = 14;
 
-/// The scales of both walls from some shots: begun at `near`, or with each wall of the first of them alone; then each beside the
-/// other one as it was begun with. `None` where the cells do not tell.
-pub(crate) fn fit(shots: &[Stretch], priors: [&Prior; 2], near: Option<[Scales; 2]>) -> Option<[Scales; 2]> {
-    let both = |job: &(dyn Fn(usize) -> Option<Scales> + Sync)| -> Option<[Scales; 2]> {
-        let (first, second) = threads::install(|| rayon::join(|| job(0), || job(1)));
-        Some([first?, second?])
-    };
-    let near = match near {
-        Some(near) => near,
-        None => {
-            let first = [(shots.first()?, None)];
-            both(&|k| likeliest(&first, k, priors[k], &priors[k].starts(), STEPS, ABOUT))?
-        }
-    };
-    (0..ROUNDS).try_fold(near, |near, _| {
-        let swept = |shot: &Stretch, k: usize| sweep(&shot.line, &shot.walls[k], &near[k], &[]);
-        both(&|k| {
-            let beside =
-                shots.iter().map(|shot| Some((shot, Some(swept(shot, 1 - k)?)))).collect::<Option<Vec<_>>>()?;
-            likeliest(&beside, k, priors[k], &[near[k]], STEPS.map(|s| SHORT * s), CLOSELY)
-        })
+/// The scales of both walls from some shots: with each wall of the first of them alone, then each beside the other one. `None` where
+/// the cells do not tell.
+pub(crate) fn fit(shots: &[Stretch], priors: [&Prior; 2]) -> Option<[Scales; 2]> {
+    let first = [(shots.first()?, None)];
+    let alone = both(&|k| likeliest(&first, k, priors[k], &priors[k].starts(), STEPS, ABOUT))?;
+    fit_near(shots, priors, fit_near(shots, priors, alone)?)
+}
+
+/// The scales of both walls, each beside the other one as it is near.
+pub(crate) fn fit_near(shots: &[Stretch], priors: [&Prior; 2], near: [Scales; 2]) -> Option<[Scales; 2]> {
+    let swept = |shot: &Stretch, k: usize| sweep(&shot.line, &shot.walls[k], &near[k], &[]);
+    both(&|k| {
+        let beside = shots.iter().map(|shot| Some((shot, Some(swept(shot, 1 - k)?)))).collect::<Option<Vec<_>>>()?;
+        likeliest(&beside, k, priors[k], &[near[k]], STEPS.map(|s| SHORT * s), CLOSELY)
     })
+}
+
+/// A job for each wall, on a thread of its own.
+fn both(job: &(dyn Fn(usize) -> Option<Scales> + Sync)) -> Option<[Scales; 2]> {
+    let (first, second) = threads::install(|| rayon::join(|| job(0), || job(1)));
+    Some([first?, second?])
 }
 
 /// The likeliest scales of wall k, from shots with what the other wall says of each, or without.
@@ -127,19 +124,18 @@ fn likeliest(
         }
         let swept = shots.iter().map(|(shot, _)| sweep(&shot.line, &shot.walls[k], &scales, &[]));
         let swept = swept.collect::<Option<Vec<Reduced>>>()?;
-        let cost = |log_noise: f64| {
+        let mut joined: Vec<Scaled> =
+            shots.iter().zip(&swept).map(|((_, beside), mine)| Scaled::new(mine, beside.as_ref())).collect();
+        let mut cost = |log_noise: f64| {
             let logs = [logs[0] + 0.5 * log_noise, logs[1], logs[2], log_noise];
             let mut sum = prior.read(&logs).1;
-            for ((shot, beside), mine) in shots.iter().zip(&swept) {
-                let mine = mine.noisier(log_noise);
-                let walls = [Some(&mine), beside.as_ref()];
-                let walls: Vec<_> = walls.into_iter().flatten().map(|wall| (wall, &shot.columns)).collect();
-                sum += Border::join(shot.columns.len(), &walls)?.cost;
+            for scaled in &mut joined {
+                sum += scaled.cost(log_noise)?;
             }
             Some((sum, logs))
         };
         let [_, _, _, [_, _, least, most]] = prior.of;
-        golden([least.ln(), most.ln()], &cost)
+        golden([least.ln(), most.ln()], &mut cost)
     };
     let worth = |logs: &[f64; 3]| Some(best_noise(logs)?.0);
     let logs = |s: &Scales| [(s.sd_mm / s.noise.sqrt()).ln(), s.along_mm.ln(), s.across_mm.ln()];
@@ -150,7 +146,7 @@ fn likeliest(
 }
 
 /// The least of a function with one bottom between two places, with what it says there.
-fn golden<T>([mut low, mut high]: [f64; 2], cost: &impl Fn(f64) -> Option<(f64, T)>) -> Option<(f64, T)> {
+fn golden<T>([mut low, mut high]: [f64; 2], cost: &mut impl FnMut(f64) -> Option<(f64, T)>) -> Option<(f64, T)> {
     let part = (5_f64.sqrt() - 1.0) / 2.0;
     let mut at = [high - part * (high - low), low + part * (high - low)];
     let mut found = [cost(at[0])?, cost(at[1])?];
@@ -235,7 +231,7 @@ mod tests {
     #[test]
     fn a_golden_section_ends_at_the_bottom() {
         for bottom in [-1.5, 0.3, 5.0] {
-            let (_, at) = golden([-1.6, 5.3], &|x| Some(((x - bottom).powi(2), x))).unwrap();
+            let (_, at) = golden([-1.6, 5.3], &mut |x: f64| Some(((x - bottom).powi(2), x))).unwrap();
             assert!((at - bottom).abs() < 0.01, "{at} is not {bottom}");
         }
     }

@@ -24,7 +24,7 @@ mod wall;
 
 pub(crate) use border::{Answer, Border, Columns};
 pub(crate) use draws::{Largest, largest};
-pub(crate) use likelihood::{Prior, fit};
+pub(crate) use likelihood::{Prior, fit, fit_near};
 pub(crate) use stretch::Stretch;
 pub(crate) use sweep::{Reduced, sweep};
 pub(crate) use wall::{Asked, Cell, Line, Scales, Wall, Width};

@@ -22,12 +22,10 @@ const ROWS: usize = 9;
 pub(crate) struct Stretch {
     pub(super) line: Line,
     pub(super) walls: [Wall; 2],
-    /// Of both walls: unknown for unknown.
-    pub(super) columns: Columns,
 }
 
 impl Stretch {
-    /// Of walls whose columns are sums of `size` unknowns.
+    /// Of walls, on an open line, whose columns are sums of `size` unknowns.
     pub fn new(line: Line, walls: [&Wall; 2], columns: [&Columns; 2], size: usize) -> Self {
         let thinned: [(Vec<f64>, Vec<bool>); 2] = walls.map(thinned);
         let whole: [Vec<f64>; 2] = std::array::from_fn(|k| whole_rows(walls[k], columns[k], size));
@@ -44,6 +42,14 @@ impl Stretch {
         let eigen = told.symmetric_eigen();
         let mut kept: Vec<usize> = (0..size).filter(|k| eigen.eigenvalues[*k] > SILENT).collect();
         kept.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
+        // Columns that no cell lies in tell nothing: only every so many are kept.
+        let used: Vec<usize> = walls.iter().flat_map(|w| w.cells().iter().map(|c| c.column)).collect();
+        let (first, last) = used.iter().fold((usize::MAX, 0), |(low, high), c| (low.min(*c), high.max(*c)));
+        let apart = used.iter().fold(0, |apart, c| common_divisor(apart, c - first)).max(1);
+        let line = match used.len() {
+            0 => line,
+            _ => Line { columns: (last - first) / apart + 1, spacing_mm: line.spacing_mm * apart as f64, ..line },
+        };
         let width = Width { common: kept.len(), of_a_shot: 0, shots: 1 };
         let walls = std::array::from_fn(|k| {
             let (rows_mm, held) = &thinned[k];
@@ -54,16 +60,21 @@ impl Stretch {
                     *slot = row.iter().zip(eigen.eigenvectors.column(*c).iter()).map(|(a, b)| a * b).sum();
                 }
             };
-            let cells = walls[k].cells().iter().zip(held).filter(|(_, held)| **held).map(|(cell, _)| *cell).collect();
+            let cells = walls[k].cells().iter().zip(held).filter(|(_, held)| **held);
+            let cells = cells.map(|(cell, _)| Cell { column: (cell.column - first) / apart, ..*cell }).collect();
             Wall::new(cells, width, rows_mm.clone(), turned)
         });
-        Self { line, walls, columns: (0..kept.len()).map(|k| vec![k]).collect() }
+        Self { line, walls }
     }
 
     /// How many cells it has.
     pub fn count(&self) -> usize {
         self.walls.iter().map(Wall::count).sum()
     }
+}
+
+fn common_divisor(a: usize, b: usize) -> usize {
+    if b == 0 { a } else { common_divisor(b, a % b) }
 }
 
 /// A wall's rows of all unknowns, cell by cell.

@@ -33,25 +33,6 @@ pub(crate) struct Reduced {
     pub covariance: Vec<f64>,
 }
 
-impl Reduced {
-    /// What it would be if all variances, of noise and unevenness, were larger by a factor. Without what was asked.
-    pub(super) fn noisier(&self, log_factor: f64) -> Self {
-        let over = (-log_factor).exp();
-        let times = |values: &[f64]| values.iter().map(|v| over * v).collect::<Vec<f64>>();
-        Self {
-            columns: self.columns,
-            cells: self.cells,
-            information: times(&self.information),
-            right: times(&self.right),
-            square: over * self.square,
-            log_det: self.log_det + self.cells as f64 * log_factor,
-            value: Vec::new(),
-            slope: Vec::new(),
-            covariance: Vec::new(),
-        }
-    }
-}
-
 /// Eliminates a wall; `None` where the numbers do not allow it.
 pub(crate) fn sweep(line: &Line, wall: &Wall, scales: &Scales, asked: &[Asked]) -> Option<Reduced> {
     let chain = Chain::new(scales.along_mm, line.spacing_mm);

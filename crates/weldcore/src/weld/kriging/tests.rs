@@ -151,7 +151,7 @@ fn dense(case: &Case) -> (f64, DVector<f64>, DMatrix<f64>) {
 
 fn both(case: &Case, prior: &Prior) -> Option<[Scales; 2]> {
     let (walls, columns) = ([&case.walls[0], &case.walls[1]], [&case.columns[0], &case.columns[1]]);
-    fit(&[Stretch::new(case.line, walls, columns, case.size)], [prior, prior], None)
+    fit(&[Stretch::new(case.line, walls, columns, case.size)], [prior, prior])
 }
 
 #[test]
@@ -178,17 +178,30 @@ fn a_turned_border_costs_the_same_at_all_scales() {
     let case = case(false);
     let (walls, columns) = ([&case.walls[0], &case.walls[1]], [&case.columns[0], &case.columns[1]]);
     let turned = Stretch::new(case.line, walls, columns, case.size);
-    assert!(turned.columns.len() < case.size, "the first shot's level and lean are those of all");
+    let size = turned.walls[0].width.common;
+    assert!(size < case.size, "level and lean of a shot that has no cells");
+    let mine: Columns = (0..size).map(|k| vec![k]).collect();
     let costs = [0.5, 1.0, 2.0].map(|factor| {
-        let of = |walls: [&Wall; 2], columns: [&Columns; 2], size: usize| {
+        let of = |line: &Line, walls: [&Wall; 2], columns: [&Columns; 2], size: usize| {
             let scales = case.scales.map(|s| Scales { sd_mm: factor * s.sd_mm, ..s });
-            let reduced = [0, 1].map(|k| sweep(&case.line, walls[k], &scales[k], &[]).unwrap());
+            let reduced = [0, 1].map(|k| sweep(line, walls[k], &scales[k], &[]).unwrap());
             Border::join(size, &[(&reduced[0], columns[0]), (&reduced[1], columns[1])]).unwrap().cost
         };
-        let mine = &turned.columns;
-        of([&turned.walls[0], &turned.walls[1]], [mine, mine], mine.len()) - of(walls, columns, case.size)
+        of(&turned.line, [&turned.walls[0], &turned.walls[1]], [&mine, &mine], size)
+            - of(&case.line, walls, columns, case.size)
     });
     assert!(costs.iter().all(|c| (c - costs[0]).abs() < 0.05), "{costs:?}");
+    // And with all variances of a wall larger by a factor.
+    let noisier = |log_factor: f64| {
+        let factor = f64::exp(log_factor);
+        let scales = [case.scales[0], Scales { sd_mm: factor.sqrt() * case.scales[1].sd_mm, ..case.scales[1] }];
+        let scales = [scales[0], Scales { noise: factor * scales[1].noise, ..scales[1] }];
+        [0, 1].map(|k| sweep(&turned.line, &turned.walls[k], &scales[k], &[]).unwrap())
+    };
+    let ([first, once], [_, twice]) = (noisier(0.0), noisier(0.7));
+    let whole = Border::join(size, &[(&first, &mine), (&twice, &mine)]).unwrap();
+    let scaled = super::border::Scaled::new(&once, Some(&first)).cost(0.7).unwrap();
+    assert!((whole.cost - scaled).abs() < 1e-6, "{} is not {scaled}", whole.cost);
 }
 
 #[test]

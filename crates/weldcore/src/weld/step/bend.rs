@@ -52,7 +52,8 @@ impl Bend {
             places.iter().map(|[at, across, _]| bend.terms(view.course.apart(*at, bend.middle), *across)).collect();
         let x = DMatrix::from_fn(known, TERMS, |i, j| rows[i][j]);
         let y = DMatrix::from_row_slice(known, count, deviation_mm);
-        let degenerate = |_| Error::Degenerate { what: "step", reason: "calibration modes: their points lie badly".into() };
+        let degenerate =
+            |_| Error::Degenerate { what: "step", reason: "calibration modes: their points lie badly".into() };
         let found = x.svd(true, true).solve(&y, 1e-9).map_err(degenerate)?;
         bend.coefficients = (0..count).flat_map(|m| (0..TERMS).map(|t| found[(t, m)]).collect::<Vec<f64>>()).collect();
         Ok(Some(bend))

@@ -5,11 +5,12 @@ use super::terms::Terms;
 use crate::error::{Error, Result};
 use crate::ground::threads;
 use crate::weld::kriging::{
-    Answer, Asked, Border, Cell, Columns as BorderColumns, Line, Prior, Reduced, Scales, Stretch, Wall, fit, sweep,
+    Answer, Asked, Border, Cell, Columns as BorderColumns, Line, Prior, Reduced, Scales, Stretch, Wall, fit, fit_near,
+    sweep,
 };
 
 /// So many shots, that share as little of the seam as may be, tell what the walls are like: the others see the same waves.
-const SHOTS_FOR_SCALES: usize = 8;
+const SHOTS_FOR_SCALES: usize = 4;
 /// Rows between the seam and a wall's first cell carry nothing; this many at most are kept there.
 const ROWS_TO_SEAM: usize = 1;
 
@@ -98,7 +99,12 @@ impl Equations {
     pub fn scales(&self, near: Option<[Scales; 2]>) -> Result<[Scales; 2]> {
         let mut shots: Vec<Stretch> = self.telling().into_iter().map(|shot| self.of_a_shot(shot).stretch()).collect();
         shots.sort_by_key(|s| std::cmp::Reverse(s.count()));
-        fit(&shots, [&self.priors[0], &self.priors[1]], near).ok_or_else(|| degenerate("the walls do not determine it"))
+        let priors = [&self.priors[0], &self.priors[1]];
+        let found = match near {
+            Some(near) => fit_near(&shots, priors, near),
+            None => fit(&shots, priors),
+        };
+        found.ok_or_else(|| degenerate("the walls do not determine it"))
     }
 
     fn stretch(&self) -> Stretch {

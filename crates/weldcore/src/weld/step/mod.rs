@@ -176,7 +176,8 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
     let gathered = gather(shots, &views, &columns)?;
     let thickness_mm = shots.iter().map(|s| s.thickness_mm).sum::<f64>() / shots.len() as f64;
     let posed = shots.iter().all(|s| s.base_from_scanner.is_some());
-    let bends = shots.iter().zip(&views).map(|(shot, view)| Bend::of(shot, view)).collect::<Result<Option<Vec<Bend>>>>()?;
+    let bends =
+        shots.iter().zip(&views).map(|(shot, view)| Bend::of(shot, view)).collect::<Result<Option<Vec<Bend>>>>()?;
     let bends = bends.unwrap_or_default();
     if bends.iter().any(|b| b.count() != bends[0].count()) {
         let (expected, got) = ("the same modes in every shot".into(), "different numbers".into());

@@ -61,7 +61,7 @@ class Scenario:
     place_rad: float = 0.0005
     """The robot's error, each way."""
     board: float = 0.0
-    """The scanner is drawn from the covariance of 15 poses of a board that fills this share of the field; 0: it is exact."""
+    """The scanner is drawn from the covariance of 15 poses of a board that fills this share of the field; 0: exact."""
 
 
 def both(*waves: tuple[float, float, float]) -> tuple:
@@ -163,7 +163,7 @@ def _weld(scenario: Scenario, random: np.random.Generator):
 
 
 def _seen_by(scanner, drawn, points: np.ndarray) -> np.ndarray:
-    """Where the scanner as it is stated puts what the one that was there saw: the same pixel, the same projector column."""
+    """Where the scanner as stated puts what the one that was there saw: the same pixel, the same projector column."""
 
     def features(of, at: np.ndarray) -> np.ndarray:
         return np.column_stack([of.camera.project(at), of.project_to_projector(at)[:, :1]])

@@ -616,7 +616,6 @@ def segment_weld(
     axis: Sequence[float] | None = None,
     zero: Sequence[float] | None = None,
 ) -> WeldShot: ...
-
 def label_weld(
     points_mm: ArrayLike, labels: NDArray[np.uint8], seam: SeamFrame, wall_thickness_mm: float
 ) -> WeldShot: ...

@@ -9,8 +9,8 @@ covariance of their unevenness, and x the row of h at the seam, the step's error
 
 C is the scanner's covariance where its file has one, and else that of a *usual good calibration* of such a scanner
 (`nominal_covariance`): inverse of the information that its poses of a board hold, the poses eliminated. The calibration
-that was really made may be worse; of one that nobody stated no better is supposed. The surfaces' step holds a stated one in its U
-(`calibration_unknowns`); the paper's histogram does not.
+that was really made may be worse; of one that nobody stated no better is supposed. The surfaces' step holds a stated
+one in its U (`calibration_unknowns`); the paper's histogram does not.
 
 Sources: GUM (JCGM 100:2008) 5.1 and its supplement 2 (JCGM 102:2011) 6.2 for the propagation; K.-R. Koch, Parameter
 Estimation (1999), 3.4 for the information of an adjustment.
@@ -235,7 +235,9 @@ def nominal_covariance(scanner: Scanner, distance_mm: float, fills: float = 1.0)
     long, short = (0, 1) if half[0] >= half[1] else (1, 0)
     corners = np.zeros((CORNERS[0] * CORNERS[1], 3))
     grid = np.meshgrid(*(np.linspace(-1, 1, n) * (1 - 1 / n) for n in CORNERS), indexing="ij")
-    corners[:, long], corners[:, short] = (fills * g.ravel() * half[k] for g, k in zip(grid, (long, short), strict=True))
+    corners[:, long], corners[:, short] = (
+        fills * g.ravel() * half[k] for g, k in zip(grid, (long, short), strict=True)
+    )
     tilts = [(near, tilt) for near in DEPTHS for tilt in TILTS_DEG]
     turns = np.array([rotation_of(np.radians([*tilt, 0.0])) for _, tilt in tilts])
     # Nearer boards are moved along the ray to the field's middle.

@@ -1,9 +1,9 @@
 """What a scanner's covariance leaves open of the part's points, as unknowns for the step's fit.
 
-A small error of the scanner's parameters bends the space that it measures, for all shots alike: a point p moves by dp/dc,
-its radial deviation by D = n . dp/dc. With C = R R^T the covariance, the columns D R belong to unknowns of unit variance;
-the fit of the step solves for them beside the walls, which are straight: so the part itself calibrates the scanner, and
-what it does not tell is in U.
+A small error of the scanner's parameters bends the space that it measures, for all shots alike: a point p moves by
+dp/dc, its radial deviation by D = n . dp/dc. With C = R R^T the covariance, the columns D R belong to unknowns of unit
+variance; the fit of the step solves for them beside the walls, which are straight: so the part itself calibrates the
+scanner, and what it does not tell is in U.
 
 Source: GUM (JCGM 100:2008) 5.1 for the propagation; K.-R. Koch, Parameter Estimation (1999), 3.6 for unknowns with a
 prior.
@@ -27,7 +27,9 @@ LEAST_MM = 1e-5
 """A mode that moves the part's points by less, rms, is left out."""
 
 
-def calibration_unknowns(covariance: Floats | None, scanner: Scanner, views: Sequence[PartView], axis: str) -> Modes | None:
+def calibration_unknowns(
+    covariance: Floats | None, scanner: Scanner, views: Sequence[PartView], axis: str
+) -> Modes | None:
     """The modes of a scanner's covariance at some points of every view, as `measure_step` takes them.
 
     Args:
@@ -37,7 +39,7 @@ def calibration_unknowns(covariance: Floats | None, scanner: Scanner, views: Seq
         axis: x or y, of the projector's coordinate that was decoded.
 
     Returns:
-        Of every view the points' numbers (n,) and their modes (n, m), mm; None where nothing is stated, or nothing open.
+        Of every view the points' numbers (n,) and their modes (n, m), mm; None where nothing is stated or open.
     """
     if covariance is None:
         return None

@@ -190,7 +190,8 @@ fn a_turned_border_costs_the_same_at_all_scales() {
         of(&turned.line, [&turned.walls[0], &turned.walls[1]], [&mine, &mine], size)
             - of(&case.line, walls, columns, case.size)
     });
-    assert!(costs.iter().all(|c| (c - costs[0]).abs() < 0.05), "{costs:?}");
+    // Not quite: rows without cells carry nothing any more.
+    assert!(costs.iter().all(|c| (c - costs[0]).abs() < COST_TOLERANCE), "{costs:?}");
     // And with all variances of a wall larger by a factor.
     let noisier = |log_factor: f64| {
         let factor = f64::exp(log_factor);

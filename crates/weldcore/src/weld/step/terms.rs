@@ -96,10 +96,8 @@ impl Terms {
         let mut series = [vec![[0.0; 2]; MOST_WAVES], vec![[0.0; 2]; MOST_WAVES]];
         series[1][0] = [0, 1].map(|k| self.offset_sigma_mm * estimate[OFFSET + k]);
         for n in 2..=MOST_WAVES {
-            for k in 0..2 {
-                let at = 2 * (n - 2) + k;
-                series[0][n - 1][k] = self.round_scale(n) * estimate[REFERENCE_ROUND + at];
-                series[1][n - 1][k] = self.round_scale(n) * estimate[STEP_ROUND + at];
+            for (series, first) in series.iter_mut().zip([REFERENCE_ROUND, STEP_ROUND]) {
+                series[n - 1] = [0, 1].map(|k| self.round_scale(n) * estimate[first + 2 * (n - 2) + k]);
             }
         }
         Self { turned: Some(series), ..self.clone() }

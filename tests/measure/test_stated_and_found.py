@@ -198,7 +198,8 @@ def test_a_pose_out_of_this_world_bars_and_takes_no_memory(
     )
     codes, _, kilobytes = ran.stdout.strip().rpartition(" ")
     assert ran.returncode == 0, ran.stderr
-    assert "'pose'" in codes and "'shots-disagree'" in codes
+    # The furthest one determines no axis common to both: nothing is measured then.
+    assert "'pose'" in codes and ("'shots-disagree'" in codes or "'shot-left-out'" in codes)
     assert int(kilobytes) < 1_000_000
 
 

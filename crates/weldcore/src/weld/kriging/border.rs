@@ -14,6 +14,8 @@
 //!
 //! Source: D. Harville, J. Am. Stat. Assoc. 72 (1977) 320, 5.2 and 6; N. Cressie, Statistics for Spatial Data (1993), 3.4.5.
 
+use nalgebra::{DMatrix, DVector};
+
 use super::rows::{add_gram, cholesky, forward};
 use super::sweep::Reduced;
 
@@ -103,6 +105,20 @@ impl Border {
             }
         }
         Answer { value, covariance, of_unevenness }
+    }
+
+    /// The unknowns where some of them are known to be 0, and how far these are from 0 together: `xᵀ C⁻¹ x`.
+    pub fn with_zero(&self, zero: &[usize]) -> Option<(Vec<f64>, f64)> {
+        let mut all = vec![0.0; self.size * self.size];
+        (0..self.size).for_each(|k| all[k * self.size + k] = 1.0);
+        let covariance = self.spread(&all);
+        let at = |i: usize, j: usize| covariance[i.min(j) * self.size + i.max(j)];
+        let own = DMatrix::from_fn(zero.len(), zero.len(), |i, j| at(zero[i], zero[j]));
+        let values = DVector::from_iterator(zero.len(), zero.iter().map(|k| self.estimate[*k]));
+        let weights = own.cholesky()?.solve(&values);
+        let moved =
+            |(k, value): (usize, &f64)| value - zero.iter().zip(&weights).map(|(z, w)| at(k, *z) * w).sum::<f64>();
+        Some((self.estimate.iter().enumerate().map(moved).collect(), values.dot(&weights)))
     }
 
     /// Covariance of linear functions of the unknowns, one a row; the upper triangle.

@@ -42,7 +42,10 @@ pub(crate) fn sweep(line: &Line, wall: &Wall, scales: &Scales, asked: &[Asked]) 
     let held = wall.width.common + wall.width.of_a_shot;
     let starts: Vec<usize> = (0..=line.columns).map(|c| wall.cells.partition_point(|cell| cell.column < c)).collect();
     let mut asked_in: Vec<Vec<usize>> = vec![Vec::new(); line.columns];
-    asked.iter().enumerate().for_each(|(k, a)| asked_in[a.column].push(k));
+    let texture = scales.is_texture();
+    if !texture {
+        asked.iter().enumerate().for_each(|(k, a)| asked_in[a.column].push(k));
+    }
 
     let mut gram = vec![0.0; columns * columns];
     let mut before: Option<Carried> = None;
@@ -111,7 +114,10 @@ pub(crate) fn sweep(line: &Line, wall: &Wall, scales: &Scales, asked: &[Asked]) 
         let lost = basis.lost(a.across_mm);
         for (j, b) in asked.iter().enumerate() {
             let rest = if a.across_mm == b.across_mm {
-                lost * a.factor * b.factor * correlation(line.apart_mm(a.column, b.column), scales.along_mm)
+                (if texture { scales.sd_mm.powi(2) } else { lost })
+                    * a.factor
+                    * b.factor
+                    * correlation(line.apart_mm(a.column, b.column), scales.along_mm)
             } else {
                 0.0
             };

@@ -154,6 +154,16 @@ pub(crate) struct Scales {
     pub noise: f64,
 }
 
+/// Unevenness that reaches less far along the seam is texture: a gauge's foot stands on several of its hills.
+const TEXTURE_MM: f64 = 5.0;
+
+impl Scales {
+    /// Is the unevenness a texture? What the next cells have of it says nothing of the step then: all of it counts as uncertain.
+    pub fn is_texture(&self) -> bool {
+        self.along_mm < TEXTURE_MM
+    }
+}
+
 /// What is asked of a wall: its height above the border's terms at a column, so far across, times a factor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Asked {

@@ -32,7 +32,7 @@ pub use profile::ProfileBin;
 pub use view::LabelledShot;
 
 use super::Course;
-use super::kriging::{Asked, Largest, Scales, largest};
+use super::kriging::{Asked, Border, Largest, Scales, largest};
 use crate::error::{Error, Result, require_count};
 use crate::ground::memory::require;
 use bend::Bend;
@@ -226,11 +226,12 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
         });
     }
     let estimate = &border.estimate;
+    let plain = plain_estimate(border, terms, residuals.len());
     let deviation_mm: Vec<Vec<f32>> = views
         .iter()
         .zip(shots)
         .enumerate()
-        .map(|(k, (view, shot))| view.over(shot, |at, across| terms.reference_height(estimate, k, at, across)))
+        .map(|(k, (view, shot))| view.over(shot, |at, across| terms.reference_height(&plain, k, at, across)))
         .collect();
     let (mean_mm, median_mm) = mean_and_median(shots, &deviation_mm);
     let told = |row: &[f64]| {
@@ -273,6 +274,18 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
         profile,
         deviation_mm,
     })
+}
+
+/// The unknowns without those that only bend or lean the walls and that the cells do not ask for (Schwarz's criterion): the
+/// reference wall is drawn on under the other one for tens of millimetres, where a lean that is none would count most.
+fn plain_estimate(border: &Border, terms: &Terms, cells: usize) -> Vec<f64> {
+    let asked_for = |off: f64, unknowns: usize| off > unknowns as f64 * (cells as f64).ln();
+    let silent = |group: &Vec<usize>| border.with_zero(group).is_some_and(|(_, off)| !asked_for(off, group.len()));
+    let zero: Vec<usize> = terms.bending().into_iter().filter(silent).flatten().collect();
+    match border.with_zero(&zero) {
+        Some((plain, off)) if !asked_for(off, zero.len()) => plain,
+        _ => border.estimate.clone(),
+    }
 }
 
 /// What is uncertain of the profile.

@@ -270,6 +270,11 @@ impl Terms {
         [0, 1].map(|k| self.pick(LEAN + k, LEAN_RAD))
     }
 
+    /// The unknowns that bend a wall or lean it against the other one: what the weld drew each in by, and the lean of the axes.
+    pub fn bending(&self) -> [Vec<usize>; 3] {
+        [SHELLS..SHELLS + SHELL, SHELLS + SHELL..MODES, LEAN..STEP_ROUND].map(Iterator::collect)
+    }
+
     /// What each wall was drawn in by, all around.
     pub fn drawn_rows(&self) -> [Vec<f64>; 2] {
         [0, 1].map(|k| self.pick(SHELLS + SHELL * k, DRAWN_MM[0]))

@@ -6,7 +6,7 @@ use pyo3::prelude::*;
 
 use crate::error::Error;
 use crate::python::call::{compute, raise};
-use crate::python::convert::{float_matrix, transform};
+use crate::python::convert::{Whole, float_matrix, parts, transform};
 use crate::python::weld::WeldShot;
 use crate::weld::step::{self, Known, LabelledShot, Modes, ProfileBin, Step, Wave};
 
@@ -106,7 +106,8 @@ impl WeldStep {
     }
     /// The largest |step| of some of the profile's bins, given by their place in it: its median, the larger half of its 95 %
     /// interval, its quantiles 0, 1, ... 100 % (101,), mm, and the factor of their band. Raises InputError without bins.
-    fn largest_of<'py>(&self, py: Python<'py>, bins: Vec<usize>) -> PyResult<Largest<'py>> {
+    fn largest_of<'py>(&self, py: Python<'py>, bins: &Bound<'py, PyAny>) -> PyResult<Largest<'py>> {
+        let bins: Vec<usize> = parts::<Vec<Whole>>("bins", "whole numbers", bins)?.iter().map(|w| w.0).collect();
         let Some(found) = compute(py, || Ok(self.0.largest_of(&bins)))? else {
             let expected = format!("some of the {} bins of the profile", self.0.profile.len());
             return Err(raise(py, &Error::OutOfRange { what: "bins", expected, value: format!("{bins:?}") }));
@@ -257,7 +258,7 @@ fn measure_step(
     shots: Vec<PyRef<'_, WeldShot>>,
     angle_sigma_rad: f64,
     base_from_scanner: Option<Vec<Bound<'_, PyAny>>>,
-    calibration_modes: Option<Vec<(Vec<usize>, Bound<'_, PyAny>)>>,
+    calibration_modes: Option<Bound<'_, PyAny>>,
 ) -> PyResult<WeldStep> {
     const NAME: &str = "base_from_scanner";
     const MODES: &str = "calibration_modes";
@@ -272,7 +273,16 @@ fn measure_step(
         }
         None => vec![None; shots.len()],
     };
-    let modes = match &calibration_modes {
+    let given = calibration_modes
+        .map(|m| {
+            parts::<Vec<(Vec<Whole>, Bound<'_, PyAny>)>>(
+                MODES,
+                "numbers of points and their modes, a pair per shot",
+                &m,
+            )
+        })
+        .transpose()?;
+    let modes = match &given {
         Some(given) if given.len() != shots.len() => {
             let (expected, got) = (format!("{} sets, one per shot", shots.len()), given.len().to_string());
             return Err(raise(py, &Error::Shape { what: MODES, expected, got }));
@@ -281,6 +291,7 @@ fn measure_step(
             .iter()
             .map(|(points, rows)| {
                 let rows = float_matrix(MODES, rows)?;
+                let points: Vec<usize> = points.iter().map(|w| w.0).collect();
                 Ok((points, rows.as_array().iter().copied().collect::<Vec<f64>>(), rows.shape()[1]))
             })
             .collect::<PyResult<Vec<_>>>()?,

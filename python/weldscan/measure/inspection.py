@@ -266,7 +266,7 @@ class _Run:
             "views" if required is None else by,
         )
         margin: CalibrationMargin | None = None
-        if self.leaves_calibration_out:
+        if self.leaves_calibration_out(found):
             margin = calibration_margin(
                 self.session.scanner,
                 self.read.scanner,
@@ -303,10 +303,9 @@ class _Run:
         """The covariance of the scanner's parameters, where its file states it."""
         return stated_covariance(self.session.scanner)
 
-    @property
-    def leaves_calibration_out(self) -> bool:
+    def leaves_calibration_out(self, step: StepResult | None) -> bool:
         """Does U hold nothing of the scanner's calibration?"""
-        return self.stated is None or self.method == "paper"
+        return self.stated is None or self.method == "paper" or step is None or step.judged == "edge"
 
     @property
     def required_deg(self) -> float | None:
@@ -403,6 +402,7 @@ class _Run:
                 "session_sha256": self.session.sha256,
             },
             verification=self.standing,
+            calibration="not stated" if self.leaves_calibration_out(step) else "stated",
             agreement=measured.agreement,
             scanner=scanner,
             seam=seam.bins if seam else (),
@@ -419,7 +419,7 @@ class _Run:
             return []
         limit_mm = min(limits)
         found = [self.edges_above(limit_mm, step)]
-        if self.leaves_calibration_out and value_mm is not None and expanded_mm is not None:
+        if self.leaves_calibration_out(step) and value_mm is not None and expanded_mm is not None:
             found.append(calibration_above(measured.calibration, limit_mm, abs(value_mm) + expanded_mm))
         return [said for said in found if said is not None]
 

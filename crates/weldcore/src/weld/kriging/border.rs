@@ -107,18 +107,41 @@ impl Border {
         Answer { value, covariance, of_unevenness }
     }
 
-    /// The unknowns where some of them are known to be 0, and how far these are from 0 together: `xᵀ C⁻¹ x`.
-    pub fn with_zero(&self, zero: &[usize]) -> Option<(Vec<f64>, f64)> {
+    /// Lets those groups of unknowns be 0 that so many observations do not ask for, by Schwarz's criterion, alone and together. The
+    /// covariance stays: what they may be all the same is uncertain as before.
+    ///
+    /// Priors are wide, and waves of the walls look a little like every term; where a term is drawn on beyond the walls, one that is
+    /// not there costs more than it is worth.
+    pub fn make_plain(&mut self, groups: impl IntoIterator<Item = Vec<usize>>, observations: usize) {
         let mut all = vec![0.0; self.size * self.size];
         (0..self.size).for_each(|k| all[k * self.size + k] = 1.0);
         let covariance = self.spread(&all);
         let at = |i: usize, j: usize| covariance[i.min(j) * self.size + i.max(j)];
-        let own = DMatrix::from_fn(zero.len(), zero.len(), |i, j| at(zero[i], zero[j]));
-        let values = DVector::from_iterator(zero.len(), zero.iter().map(|k| self.estimate[*k]));
-        let weights = own.cholesky()?.solve(&values);
-        let moved =
-            |(k, value): (usize, &f64)| value - zero.iter().zip(&weights).map(|(z, w)| at(k, *z) * w).sum::<f64>();
-        Some((self.estimate.iter().enumerate().map(moved).collect(), values.dot(&weights)))
+        // Where these are 0: how far they are from it together, `xᵀ C⁻¹ x`, and what that makes of all others.
+        let with_zero = |zero: &[usize]| -> Option<(f64, DVector<f64>)> {
+            let own = DMatrix::from_fn(zero.len(), zero.len(), |i, j| at(zero[i], zero[j]));
+            let values = DVector::from_iterator(zero.len(), zero.iter().map(|k| self.estimate[*k]));
+            let weights = own.cholesky()?.solve(&values);
+            Some((values.dot(&weights), weights))
+        };
+        let price = |unknowns: usize| unknowns as f64 * (observations as f64).ln();
+        let mut silent: Vec<(f64, Vec<usize>)> = groups
+            .into_iter()
+            .filter_map(|group| Some((with_zero(&group)?.0 - price(group.len()), group)))
+            .filter(|(over, _)| *over < 0.0)
+            .collect();
+        silent.sort_by(|a, b| a.0.total_cmp(&b.0));
+        while !silent.is_empty() {
+            let zero: Vec<usize> = silent.iter().flat_map(|(_, group)| group.iter().copied()).collect();
+            if let Some((off, weights)) = with_zero(&zero)
+                && off < price(zero.len())
+            {
+                let moved = |k: usize| zero.iter().zip(&weights).map(|(z, w)| at(k, *z) * w).sum::<f64>();
+                self.estimate = (0..self.size).map(|k| self.estimate[k] - moved(k)).collect();
+                return;
+            }
+            silent.pop();
+        }
     }
 
     /// Covariance of linear functions of the unknowns, one a row; the upper triangle.

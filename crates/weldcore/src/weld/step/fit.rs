@@ -176,8 +176,9 @@ impl Equations {
     pub fn solve(&self, scales: &[Scales; 2], asked: [&[Asked]; 2], rows: &[f64]) -> Result<Solved> {
         let reduced = self.swept(scales, asked)?;
         let walls = [(&reduced[0], &self.border[0]), (&reduced[1], &self.border[1])];
-        let border =
+        let mut border =
             Border::join(self.terms.count(), &walls).ok_or_else(|| degenerate("its terms have no solution"))?;
+        border.make_plain(self.terms.optional(), self.walls.iter().map(Wall::count).sum());
         let answer = border.answer(rows, &walls);
         if answer.value.iter().chain(&answer.covariance).any(|v| !v.is_finite()) {
             return Err(degenerate("the fit of the walls did not converge"));

@@ -1,19 +1,19 @@
 //! The step along the seam: how far the other wall stands out from the reference wall, with its uncertainty.
 //!
 //! All shots are unrolled about one axis: their places in base, then one cylinder on the reference wall of all of them
-//! ([`view`]). The points of each wall are averaged into the cells of one grid ([`cells`]). In the seam's frame the height of a
+//! (`view.rs`). The points of each wall are averaged into the cells of one grid (`cells.rs`). In the seam's frame the height of a
 //! cell of shot k at a place θ along it and s across it (from its centreline) is
 //!
 //! - on the reference wall: `ref(θ) + shot_k(θ, s) + drawn(θ, s) + f(θ, s) + e`,
 //! - on the other wall: `ref(θ) + h(θ, s) + shot_k(θ, s) + drawn'(θ, s) + f'(θ, s) + e`,
 //!
 //! with Fourier terms `ref` and `h`, what shot k is displaced by (which moves both walls alike), what the weld drew each wall in by,
-//! what the scanner's calibration leaves open ([`bend`]), all with priors ([`terms`]); and each wall's own unevenness f, a Gaussian process whose scales the cells themselves tell.
-//! Both walls are kriged to the seam ([`crate::weld::kriging`]): the step is that of the surfaces there, waves and shrinkage
+//! what the scanner's calibration leaves open (`bend.rs`), all with priors (`terms.rs`); and each wall's own unevenness f, a Gaussian
+//! process whose scales the cells themselves tell. Both walls are kriged to the seam (`weld/kriging`): the step is that of the surfaces there, waves and shrinkage
 //! included, with one covariance for all bins. A shot's turn about the axis is solved for in a second pass, where the walls
 //! found so far say what it changes.
 //!
-//! What the cap hides follows from the walls only as long as they run on to it; [`guard`] tells where they do not.
+//! What the cap hides follows from the walls only as long as they run on to it; `guard.rs` tells where they do not.
 //!
 //! Sources: N. Cressie, Statistics for Spatial Data (1993), 3.4; GUM (JCGM 100:2008) 5.2.2; JCGM 101:2008, 7.
 
@@ -32,7 +32,7 @@ pub use profile::ProfileBin;
 pub use view::LabelledShot;
 
 use super::Course;
-use super::kriging::{Asked, Border, Largest, Scales, largest};
+use super::kriging::{Asked, Largest, Scales, largest};
 use crate::error::{Error, Result, require_count};
 use crate::ground::memory::require;
 use bend::Bend;
@@ -226,12 +226,11 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
         });
     }
     let estimate = &border.estimate;
-    let plain = plain_estimate(border, terms, residuals.len());
     let deviation_mm: Vec<Vec<f32>> = views
         .iter()
         .zip(shots)
         .enumerate()
-        .map(|(k, (view, shot))| view.over(shot, |at, across| terms.reference_height(&plain, k, at, across)))
+        .map(|(k, (view, shot))| view.over(shot, |at, across| terms.reference_height(estimate, k, at, across)))
         .collect();
     let (mean_mm, median_mm) = mean_and_median(shots, &deviation_mm);
     let told = |row: &[f64]| {
@@ -274,18 +273,6 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
         profile,
         deviation_mm,
     })
-}
-
-/// The unknowns without those that only bend or lean the walls and that the cells do not ask for (Schwarz's criterion): the
-/// reference wall is drawn on under the other one for tens of millimetres, where a lean that is none would count most.
-fn plain_estimate(border: &Border, terms: &Terms, cells: usize) -> Vec<f64> {
-    let asked_for = |off: f64, unknowns: usize| off > unknowns as f64 * (cells as f64).ln();
-    let silent = |group: &Vec<usize>| border.with_zero(group).is_some_and(|(_, off)| !asked_for(off, group.len()));
-    let zero: Vec<usize> = terms.bending().into_iter().filter(silent).flatten().collect();
-    match border.with_zero(&zero) {
-        Some((plain, off)) if !asked_for(off, zero.len()) => plain,
-        _ => border.estimate.clone(),
-    }
 }
 
 /// What is uncertain of the profile.

@@ -5,7 +5,7 @@
 //! | difference of the radii, n = 0 of the step | other wall | 0.5 % of the diameter, 1 mm at least: the tolerance of diameters (EN 10216) |
 //! | offset of the axes, n = 1 | other wall | a wall's thickness, 3 mm at least: fit-up |
 //! | lean of the axes | other wall | 0.02 rad: wide, the walls tell it |
-//! | n = 2 to 12 of the step, and of the reference wall | | (D/400 or 0.5 mm) (2/n)²: out of roundness of 1 % is an amplitude of D/400 |
+//! | n = 2 to 12 of the step, and of the reference wall | | (D/200 or 1 mm) (2/n)²: twice an out of roundness of 1 %, which is an amplitude of D/400 |
 //! | what the weld drew a wall in by, n = 0; n = 1, 2 | each wall | 0.2 mm; 0.05 mm |
 //! | radius, place and lean of a shot | both walls | one shot, or no poses: 5 mm, 20 mrad; several: 0.1 mm, 0.5 mm, 2 mrad, a robot's |
 //! | turn of a shot about the axis | both walls | 0.5 mm of place |
@@ -39,7 +39,7 @@ const MODES: usize = SHELLS + 2 * SHELL;
 const LEAST_RADIUS_MM: f64 = 1.0;
 const LEAST_OFFSET_MM: f64 = 3.0;
 const LEAN_RAD: f64 = 0.02;
-const LEAST_ROUND_MM: f64 = 0.5;
+const LEAST_ROUND_MM: f64 = 1.0;
 const DRAWN_MM: [f64; SHELL] = [0.2, 0.05, 0.05, 0.05, 0.05];
 const TURN_MM: f64 = 0.5;
 
@@ -85,7 +85,7 @@ impl Terms {
             middles,
             radius_sigma_mm: LEAST_RADIUS_MM.max(diameter / 200.0),
             offset_sigma_mm: LEAST_OFFSET_MM.max(thickness_mm),
-            round_sigma_mm: LEAST_ROUND_MM.max(diameter / 400.0),
+            round_sigma_mm: LEAST_ROUND_MM.max(diameter / 200.0),
             turned: None,
             bends,
         }
@@ -270,9 +270,14 @@ impl Terms {
         [0, 1].map(|k| self.pick(LEAN + k, LEAN_RAD))
     }
 
-    /// The unknowns that bend a wall or lean it against the other one: what the weld drew each in by, and the lean of the axes.
-    pub fn bending(&self) -> [Vec<usize>; 3] {
-        [SHELLS..SHELLS + SHELL, SHELLS + SHELL..MODES, LEAN..STEP_ROUND].map(Iterator::collect)
+    /// Groups of unknowns that may well be none: what the weld drew each wall in by, the lean of the axes, each Fourier term of the
+    /// step from n = 2 on.
+    pub fn optional(&self) -> impl Iterator<Item = Vec<usize>> {
+        let round = (STEP_ROUND..REFERENCE_ROUND).step_by(2).map(|k| k..k + 2);
+        [SHELLS..SHELLS + SHELL, SHELLS + SHELL..MODES, LEAN..STEP_ROUND]
+            .into_iter()
+            .chain(round)
+            .map(Iterator::collect)
     }
 
     /// What each wall was drawn in by, all around.

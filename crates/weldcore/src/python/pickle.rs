@@ -38,7 +38,7 @@ use crate::surfaces::find_spheres::FoundSphere;
 use crate::surfaces::{Cylinder, Plane, Sphere};
 use crate::weld::sections::{Doubt, Edge, Grid, Kind, Sections, Station, WallRun};
 use crate::weld::segment::Segmentation;
-use crate::weld::step::{LargestStep, ProfileBin, Step, Unevenness, Wave};
+use crate::weld::step::{FoundUnevenness, LargestStep, ProfileBin, Step, StepWave};
 use crate::weld::{Course, Seam, Unrolled};
 
 const VERSION: &str = env!("CARGO_PKG_VERSION");
@@ -209,8 +209,8 @@ structs! {
     }
     ProfileBin { along, step_mm, standard_mm, fit_mm, unevenness_mm, place_mm, band_mm, departure }
     LargestStep { at, quantiles, interval_mm, band_factor }
-    Wave { n, amplitude_mm, standard_mm, prior_mm }
-    Unevenness { sd_mm, reach_mm, noise }
+    StepWave { n, amplitude_mm, standard_mm, prior_mm }
+    FoundUnevenness { sd_mm, reach_mm, noise }
     Step {
         mean_mm, median_mm, seam_mean_mm, largest, profile, covariance_mm2, departure_limit, coverage, curvature_mm,
         offset_mm, offset_standard_mm, tilt_rad, tilt_standard_rad, waves, shrinkage_mm, unevenness, residual_rms_mm,

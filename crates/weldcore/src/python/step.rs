@@ -8,7 +8,7 @@ use crate::error::Error;
 use crate::python::call::{compute, raise};
 use crate::python::convert::{Whole, float_matrix, parts, transform};
 use crate::python::weld::WeldShot;
-use crate::weld::step::{self, Known, LabelledShot, Modes, ProfileBin, Step, Wave};
+use crate::weld::step::{self, Known, LabelledShot, Modes, ProfileBin, Step, StepWave};
 
 /// A column of the profile: its name, and what it holds of a bin.
 type Column = (&'static str, fn(&ProfileBin) -> f64);
@@ -53,7 +53,7 @@ const FIELDS: [&str; 24] = [
 ];
 
 /// How large the largest step of some bins is: its median, the larger half of its 95 % interval, its quantiles 0, 1, ... 100 %, c.
-type Largest<'py> = (f64, f64, Bound<'py, PyArray1<f64>>, f64);
+type LargestOf<'py> = (f64, f64, Bound<'py, PyArray1<f64>>, f64);
 
 /// The step of the other wall over the reference wall (see `measure_step`).
 ///
@@ -106,7 +106,7 @@ impl WeldStep {
     }
     /// The largest |step| of some of the profile's bins, given by their place in it: its median, the larger half of its 95 %
     /// interval, its quantiles 0, 1, ... 100 % (101,), mm, and the factor of their band. Raises InputError without bins.
-    fn largest_of<'py>(&self, py: Python<'py>, bins: &Bound<'py, PyAny>) -> PyResult<Largest<'py>> {
+    fn largest_of<'py>(&self, py: Python<'py>, bins: &Bound<'py, PyAny>) -> PyResult<LargestOf<'py>> {
         let bins: Vec<usize> = parts::<Vec<Whole>>("bins", "whole numbers", bins)?.iter().map(|w| w.0).collect();
         let Some(found) = compute(py, || Ok(self.0.largest_of(&bins)))? else {
             let expected = format!("some of the {} bins of the profile", self.0.profile.len());
@@ -119,7 +119,7 @@ impl WeldStep {
     /// each before the scan), mm, for n = 2 and up.
     #[getter]
     fn waves_mm(&self) -> Vec<(usize, f64, f64, f64, f64, f64)> {
-        let row = |w: &Wave| {
+        let row = |w: &StepWave| {
             let ([c, s], [uc, us]) = (w.amplitude_mm, w.standard_mm);
             (w.n, c, s, uc, us, w.prior_mm)
         };
@@ -169,7 +169,7 @@ impl WeldStep {
     /// The highest Fourier term of the step that stands out of its uncertainty; 1 where none does.
     #[getter]
     fn shape_degree(&self) -> usize {
-        let told = |w: &&Wave| w.amplitude_mm.iter().zip(w.standard_mm).any(|(a, u)| a.abs() > 3.0 * u);
+        let told = |w: &&StepWave| w.amplitude_mm.iter().zip(w.standard_mm).any(|(a, u)| a.abs() > 3.0 * u);
         self.0.waves.iter().filter(told).map(|w| w.n).max().unwrap_or(1)
     }
     /// What the weld drew the reference wall and the other wall in, mm.

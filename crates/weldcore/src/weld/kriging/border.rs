@@ -20,7 +20,7 @@ use super::rows::{add_gram, cholesky, forward};
 use super::sweep::Reduced;
 
 /// Which of the border's unknowns each column of a wall is: the sum of one or several.
-pub(crate) type Columns = Vec<Vec<usize>>;
+pub(crate) type BorderColumns = Vec<Vec<usize>>;
 
 /// Both walls' equations for the border, solved.
 #[derive(Debug, Clone)]
@@ -47,7 +47,7 @@ pub(crate) struct Answer {
 
 impl Border {
     /// Joins walls; `None` where the numbers do not allow it.
-    pub fn join(size: usize, walls: &[(&Reduced, &Columns)]) -> Option<Self> {
+    pub fn join(size: usize, walls: &[(&Reduced, &BorderColumns)]) -> Option<Self> {
         let mut lower = vec![0.0; size * size];
         let mut right = vec![0.0; size];
         (0..size).for_each(|k| lower[k * size + k] = 1.0);
@@ -81,7 +81,7 @@ impl Border {
     }
 
     /// What was asked of the walls, with `rows` of the border (asked times unknowns) added.
-    pub fn answer(&self, rows: &[f64], walls: &[(&Reduced, &Columns)]) -> Answer {
+    pub fn answer(&self, rows: &[f64], walls: &[(&Reduced, &BorderColumns)]) -> Answer {
         let asked = rows.len() / self.size;
         let mut left = rows.to_vec();
         let (mut value, mut covariance) = (vec![0.0; asked], vec![0.0; asked * asked]);

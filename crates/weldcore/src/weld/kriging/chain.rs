@@ -12,7 +12,7 @@ pub(super) type Two = [[f64; 2]; 2];
 
 /// The blocks of a chain's precision.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Chain {
+pub(super) struct ColumnChain {
     /// Of a column between two others.
     pub inner: Two,
     /// Of the first and the last column of an open chain.
@@ -24,7 +24,7 @@ pub(super) struct Chain {
     pub rate: f64,
 }
 
-impl Chain {
+impl ColumnChain {
     /// The chain of waves of this length between columns this far apart.
     pub fn new(length_mm: f64, spacing_mm: f64) -> Self {
         let rate = 3_f64.sqrt() / length_mm;
@@ -76,7 +76,7 @@ mod tests {
     #[test]
     fn an_open_chain_has_the_covariance_of_the_process() {
         for (length, spacing) in [(5.0, 5.0), (25.0, 4.0), (400.0, 5.0), (600.0, 0.5)] {
-            let chain = Chain::new(length, spacing);
+            let chain = ColumnChain::new(length, spacing);
             let n = 12;
             let mut precision = DMatrix::<f64>::zeros(2 * n, 2 * n);
             for c in 0..n {

@@ -22,9 +22,9 @@ mod sweep;
 mod tests;
 mod wall;
 
-pub(crate) use border::{Answer, Border, Columns};
+pub(crate) use border::{Answer, Border, BorderColumns};
 pub(crate) use draws::{Largest, largest};
 pub(crate) use likelihood::{Prior, fit, fit_near};
 pub(crate) use stretch::Stretch;
 pub(crate) use sweep::{Reduced, sweep};
-pub(crate) use wall::{Asked, Cell, Line, Scales, Wall, Width};
+pub(crate) use wall::{Asked, Cell, KrigedWall, Scales, SeamLine, Width};

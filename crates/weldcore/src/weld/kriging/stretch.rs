@@ -7,8 +7,8 @@
 
 use nalgebra::DMatrix;
 
-use super::border::Columns;
-use super::wall::{Cell, Line, Wall, Width};
+use super::border::BorderColumns;
+use super::wall::{Cell, KrigedWall, SeamLine, Width};
 
 /// Information, in units of the prior's, below which the cells are silent.
 const SILENT: f64 = 1e-3;
@@ -20,13 +20,13 @@ const ROWS: usize = 9;
 /// Both walls of one shot.
 #[derive(Debug, Clone)]
 pub(crate) struct Stretch {
-    pub(super) line: Line,
-    pub(super) walls: [Wall; 2],
+    pub(super) line: SeamLine,
+    pub(super) walls: [KrigedWall; 2],
 }
 
 impl Stretch {
     /// Of walls, on an open line, whose columns are sums of `size` unknowns.
-    pub fn new(line: Line, walls: [&Wall; 2], columns: [&Columns; 2], size: usize) -> Self {
+    pub fn new(line: SeamLine, walls: [&KrigedWall; 2], columns: [&BorderColumns; 2], size: usize) -> Self {
         let thinned: [(Vec<f64>, Vec<bool>); 2] = walls.map(thinned);
         let whole: [Vec<f64>; 2] = std::array::from_fn(|k| whole_rows(walls[k], columns[k], size));
         let mut told = DMatrix::<f64>::zeros(size, size);
@@ -42,13 +42,13 @@ impl Stretch {
         let eigen = told.symmetric_eigen();
         let mut kept: Vec<usize> = (0..size).filter(|k| eigen.eigenvalues[*k] > SILENT).collect();
         kept.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
-        // Columns that no cell lies in tell nothing: only every so many are kept.
+        // BorderColumns that no cell lies in tell nothing: only every so many are kept.
         let used: Vec<usize> = walls.iter().flat_map(|w| w.cells().iter().map(|c| c.column)).collect();
         let (first, last) = used.iter().fold((usize::MAX, 0), |(low, high), c| (low.min(*c), high.max(*c)));
         let apart = used.iter().fold(0, |apart, c| common_divisor(apart, c - first)).max(1);
         let line = match used.len() {
             0 => line,
-            _ => Line { columns: (last - first) / apart + 1, spacing_mm: line.spacing_mm * apart as f64, ..line },
+            _ => SeamLine { columns: (last - first) / apart + 1, spacing_mm: line.spacing_mm * apart as f64, ..line },
         };
         let width = Width { common: kept.len(), of_a_shot: 0, shots: 1 };
         let walls = std::array::from_fn(|k| {
@@ -62,14 +62,14 @@ impl Stretch {
             };
             let cells = walls[k].cells().iter().zip(held).filter(|(_, held)| **held);
             let cells = cells.map(|(cell, _)| Cell { column: (cell.column - first) / apart, ..*cell }).collect();
-            Wall::new(cells, width, rows_mm.clone(), turned)
+            KrigedWall::new(cells, width, rows_mm.clone(), turned)
         });
         Self { line, walls }
     }
 
     /// How many cells it has.
     pub fn count(&self) -> usize {
-        self.walls.iter().map(Wall::count).sum()
+        self.walls.iter().map(KrigedWall::count).sum()
     }
 }
 
@@ -78,7 +78,7 @@ fn common_divisor(a: usize, b: usize) -> usize {
 }
 
 /// A wall's rows of all unknowns, cell by cell.
-fn whole_rows(wall: &Wall, columns: &Columns, size: usize) -> Vec<f64> {
+fn whole_rows(wall: &KrigedWall, columns: &BorderColumns, size: usize) -> Vec<f64> {
     let width = wall.width();
     let mut whole = vec![0.0; wall.count() * size];
     for ((cell, own), row) in wall.cells().iter().zip(wall.rows()).zip(whole.chunks_exact_mut(size.max(1))) {
@@ -91,7 +91,7 @@ fn whole_rows(wall: &Wall, columns: &Columns, size: usize) -> Vec<f64> {
 }
 
 /// The rows that carry a wall's unevenness, where there are cells, and whether each cell lies in one of them.
-fn thinned(wall: &Wall) -> (Vec<f64>, Vec<bool>) {
+fn thinned(wall: &KrigedWall) -> (Vec<f64>, Vec<bool>) {
     let rows = wall.rows_mm();
     let nearest = |cell: &Cell| {
         let off = |k: &usize| (rows[*k] - cell.across_mm).abs();

@@ -8,15 +8,15 @@
 //! Source: H. Rue and L. Held, Gaussian Markov Random Fields (2005), 2.3 and 2.4.
 
 use super::basis::Basis;
-use super::chain::{Chain, Two, correlation, transposed};
+use super::chain::{ColumnChain, Two, correlation, transposed};
 use super::rows::{add_cell, add_gram, cholesky, forward, subtract_gram, subtract_product};
-use super::wall::{Asked, Line, Scales, Wall};
+use super::wall::{Asked, KrigedWall, Scales, SeamLine};
 use crate::ground::stop::poll;
 
 /// A wall without its unevenness: what its cells say of the border, and of what was asked.
 #[derive(Debug, Clone)]
 pub(crate) struct Reduced {
-    /// Columns of the wall's border.
+    /// BorderColumns of the wall's border.
     pub columns: usize,
     /// Cells of the wall.
     pub cells: usize,
@@ -34,8 +34,8 @@ pub(crate) struct Reduced {
 }
 
 /// Eliminates a wall; `None` where the numbers do not allow it.
-pub(crate) fn sweep(line: &Line, wall: &Wall, scales: &Scales, asked: &[Asked]) -> Option<Reduced> {
-    let chain = Chain::new(scales.along_mm, line.spacing_mm);
+pub(crate) fn sweep(line: &SeamLine, wall: &KrigedWall, scales: &Scales, asked: &[Asked]) -> Option<Reduced> {
+    let chain = ColumnChain::new(scales.along_mm, line.spacing_mm);
     let basis = Basis::new(&wall.rows_mm, scales.sd_mm, scales.across_mm);
     let (rank, border, over) = (basis.rank(), wall.width.total(), 1.0 / scales.noise);
     let columns = border + 1 + asked.len();
@@ -225,7 +225,7 @@ fn spread(matrix: &mut [f64], stride: usize, row: usize, column: usize, rank: us
 
 /// The links between the two columns of a block, which are neighbours at either end of the fold: the last fold's second column
 /// follows its first, the first fold's first column follows its second.
-fn couple_within(own: &mut [f64], block: &[usize], rank: usize, chain: &Chain) {
+fn couple_within(own: &mut [f64], block: &[usize], rank: usize, chain: &ColumnChain) {
     let &[one, other] = block else { return };
     let size = 4 * rank;
     if other == one + 1 {
@@ -237,7 +237,7 @@ fn couple_within(own: &mut [f64], block: &[usize], rank: usize, chain: &Chain) {
 }
 
 /// The links from a block to the next one: from its rows to that one's columns.
-fn couple_to_next(line: &Line, rank: usize, chain: &Chain) -> Vec<f64> {
+fn couple_to_next(line: &SeamLine, rank: usize, chain: &ColumnChain) -> Vec<f64> {
     let size = if line.closed { 4 * rank } else { 2 * rank };
     let mut links = vec![0.0; size * size];
     spread(&mut links, size, 0, 0, rank, &transposed(&chain.link));
@@ -248,7 +248,7 @@ fn couple_to_next(line: &Line, rank: usize, chain: &Chain) -> Vec<f64> {
 }
 
 /// The logarithm of the determinant of a chain's precision, eliminated as the wall is.
-fn log_det_of_chain(line: &Line, chain: &Chain) -> Option<f64> {
+fn log_det_of_chain(line: &SeamLine, chain: &ColumnChain) -> Option<f64> {
     let mut log_det = 0.0;
     let mut carry: Option<Vec<f64>> = None;
     for block in line.blocks() {

@@ -18,16 +18,16 @@ fn uniform(k: u64) -> f64 {
 }
 
 struct Case {
-    line: Line,
-    walls: [Wall; 2],
-    columns: [Columns; 2],
+    line: SeamLine,
+    walls: [KrigedWall; 2],
+    columns: [BorderColumns; 2],
     size: usize,
     scales: [Scales; 2],
 }
 
 /// Two walls of two shots, with a level and a slope of each shot (both walls), and one step.
 fn case(closed: bool) -> Case {
-    let line = Line { columns: 24, spacing_mm: 5.0, closed };
+    let line = SeamLine { columns: 24, spacing_mm: 5.0, closed };
     let width = [Width { common: 1, of_a_shot: 2, shots: 2 }, Width { common: 2, of_a_shot: 2, shots: 2 }];
     let rows_mm = |sign: f64| (0..8).map(|k| sign * (5.0 * f64::from(k))).collect::<Vec<f64>>();
     let mut seed = 1;
@@ -52,7 +52,7 @@ fn case(closed: bool) -> Case {
                 }
             }
         }
-        Wall::new(cells, width[k], rows_mm(sign), |cell, out| {
+        KrigedWall::new(cells, width[k], rows_mm(sign), |cell, out| {
             // A term common to both walls; the step on the other one; level and lean of the shot.
             out[0] = 0.3 * (cell.column as f64 / 4.0).sin();
             if k == 1 {
@@ -180,9 +180,9 @@ fn a_turned_border_costs_the_same_at_all_scales() {
     let turned = Stretch::new(case.line, walls, columns, case.size + 2);
     let size = turned.walls[0].width.common;
     assert_eq!(size, case.size, "two unknowns that no cell tells are left out");
-    let mine: Columns = (0..size).map(|k| vec![k]).collect();
+    let mine: BorderColumns = (0..size).map(|k| vec![k]).collect();
     let costs = [0.5, 1.0, 2.0].map(|factor| {
-        let of = |line: &Line, walls: [&Wall; 2], columns: [&Columns; 2], size: usize| {
+        let of = |line: &SeamLine, walls: [&KrigedWall; 2], columns: [&BorderColumns; 2], size: usize| {
             let scales = case.scales.map(|s| Scales { sd_mm: factor * s.sd_mm, ..s });
             let reduced = [0, 1].map(|k| sweep(line, walls[k], &scales[k], &[]).unwrap());
             Border::join(size, &[(&reduced[0], columns[0]), (&reduced[1], columns[1])]).unwrap().cost
@@ -233,7 +233,7 @@ fn the_likeliest_scales_are_those_that_walls_were_drawn_from() {
             let held = wall.width.common + wall.width.of_a_shot;
             let rows = wall.rows.clone();
             let row = std::cell::Cell::new(0);
-            case.walls[w] = Wall::new(cells, wall.width, wall.rows_mm.clone(), |_, out| {
+            case.walls[w] = KrigedWall::new(cells, wall.width, wall.rows_mm.clone(), |_, out| {
                 out.copy_from_slice(&rows[row.get() * held..][..held]);
                 row.set(row.get() + 1);
             });

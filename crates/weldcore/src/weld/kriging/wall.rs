@@ -1,17 +1,17 @@
 //! What is known of one wall: its cells, column by column along the seam, with their rows of the border.
 
-use super::chain::{Chain, Two};
+use super::chain::{ColumnChain, Two};
 
 /// The columns along the seam.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Line {
+pub(crate) struct SeamLine {
     pub columns: usize,
     pub spacing_mm: f64,
     /// Whether the last column is followed by the first; their number is even then.
     pub closed: bool,
 }
 
-impl Line {
+impl SeamLine {
     /// What is eliminated together: a column; around a closed seam one from either end, which keeps every block beside the next.
     pub(super) fn blocks(&self) -> impl Iterator<Item = Vec<usize>> {
         let Self { columns, closed, .. } = *self;
@@ -20,7 +20,7 @@ impl Line {
     }
 
     /// A column's own block of the chain's precision.
-    pub(super) fn own(&self, chain: &Chain, column: usize) -> Two {
+    pub(super) fn own(&self, chain: &ColumnChain, column: usize) -> Two {
         if self.closed {
             chain.inner
         } else if self.columns == 1 {
@@ -77,7 +77,7 @@ impl Width {
 
 /// One wall: its cells in the order of their columns, and what of the sums over them does not depend on its unevenness.
 #[derive(Debug, Clone)]
-pub(crate) struct Wall {
+pub(crate) struct KrigedWall {
     pub(super) cells: Vec<Cell>,
     /// A row per cell: the common columns, then those of the cell's own shot. Every column in units of its prior.
     pub(super) rows: Vec<f64>,
@@ -91,7 +91,7 @@ pub(crate) struct Wall {
     pub(super) log_weights: f64,
 }
 
-impl Wall {
+impl KrigedWall {
     /// A wall of these cells; `row_of` writes a cell's row of the border.
     pub fn new(
         mut cells: Vec<Cell>,

@@ -6,7 +6,7 @@
 
 use nalgebra::DMatrix;
 
-use super::view::{LabelledShot, View};
+use super::view::{LabelledShot, ShotView};
 use crate::error::{Error, Result, require_count};
 
 /// Of the polynomial: a lens' fifth-order distortion over a view.
@@ -37,7 +37,7 @@ pub(super) struct Bend {
 impl Bend {
     /// # Errors
     /// [`Error::Shape`] where points and rows do not agree, [`Error::TooFew`] where the points do not tell a polynomial.
-    pub fn of(shot: &LabelledShot, view: &View) -> Result<Option<Self>> {
+    pub fn of(shot: &LabelledShot, view: &ShotView) -> Result<Option<Self>> {
         let Some(Modes { points, deviation_mm, count }) = shot.modes else { return Ok(None) };
         let known = points.len();
         if deviation_mm.len() != known * count || points.iter().any(|&i| i >= shot.labels.len()) {

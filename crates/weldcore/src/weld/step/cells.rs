@@ -2,12 +2,12 @@
 
 use rayon::prelude::*;
 
-use super::view::{LabelledShot, View, is_wall};
+use super::view::{LabelledShot, ShotView, is_wall};
 use crate::error::{Error, Result, require_count};
 use crate::ground::robust::median;
 use crate::ground::stop::polled;
 use crate::ground::threads;
-use crate::weld::kriging::{Cell, Line};
+use crate::weld::kriging::{Cell, SeamLine};
 use crate::weld::seam::Course;
 
 /// Length of a cell along and across the seam, about: fine enough for waves of 8 mm.
@@ -75,17 +75,17 @@ impl Columns {
     }
 }
 
-/// Sums over a cell's points, about its middle: number, place along (in the seam's parameter) and across, height, and their products.
-type Sums = [f64; 10];
+/// CellSums over a cell's points, about its middle: number, place along (in the seam's parameter) and across, height, and their products.
+type CellSums = [f64; 10];
 
-fn add(sums: &mut Sums, a: f64, z: f64, h: f64) {
+fn add(sums: &mut CellSums, a: f64, z: f64, h: f64) {
     for (slot, v) in sums.iter_mut().zip([1.0, a, z, h, a * a, a * z, z * z, a * h, z * h, h * h]) {
         *slot += v;
     }
 }
 
 /// What is left of the heights after a plane, squared and summed, and how many differences that is of.
-fn scatter(s: &Sums) -> (f64, f64) {
+fn scatter(s: &CellSums) -> (f64, f64) {
     let n = s[0];
     let about = |product: f64, i: usize, j: usize| product - s[i] * s[j] / n;
     let (aa, az, zz) = (about(s[4], 1, 1), about(s[5], 1, 2), about(s[6], 2, 2));
@@ -116,7 +116,7 @@ pub(super) struct Gathered {
 /// A bin counts as seen when each wall has this part of the points of a typical bin: edges of the view fill bins partly.
 const SEEN_PART: f64 = 0.1;
 
-pub(super) fn gather(shots: &[LabelledShot], views: &[View], columns: &Columns) -> Result<Gathered> {
+pub(super) fn gather(shots: &[LabelledShot], views: &[ShotView], columns: &Columns) -> Result<Gathered> {
     // The rows are common to all shots.
     let mut reach = [[f64::INFINITY, 0.0_f64]; 2];
     for view in views {
@@ -154,7 +154,7 @@ struct OfShot {
     typical: [f64; 2],
 }
 
-fn of_shot(shot: &LabelledShot, view: &View, columns: &Columns, rows_mm: [f64; 2], reach: [[f64; 2]; 2]) -> OfShot {
+fn of_shot(shot: &LabelledShot, view: &ShotView, columns: &Columns, rows_mm: [f64; 2], reach: [[f64; 2]; 2]) -> OfShot {
     let course = columns.course;
     // Cells along the stretch of this shot alone, from its first one on.
     let cell_at = columns.spacing() * columns.of_a_cell as f64;
@@ -164,7 +164,7 @@ fn of_shot(shot: &LabelledShot, view: &View, columns: &Columns, rows_mm: [f64; 2
     let total = along * (rows[0] + rows[1]);
     let bins = course.bins();
     let indices: Vec<usize> = (0..shot.labels.len()).collect();
-    let parts: Vec<(Vec<Sums>, Vec<[f64; 2]>)> = threads::install(|| {
+    let parts: Vec<(Vec<CellSums>, Vec<[f64; 2]>)> = threads::install(|| {
         indices
             .par_chunks(16 * threads::CHUNK)
             .inspect(polled)
@@ -199,7 +199,7 @@ fn of_shot(shot: &LabelledShot, view: &View, columns: &Columns, rows_mm: [f64; 2
         let (square, free) = mine.iter().map(scatter).fold((0.0, 0.0), |a, b| (a.0 + b.0, a.1 + b.1));
         let scatter = if free >= TELLING { (square / free).sqrt() } else { USUAL_SCATTER_MM };
         let variance = scatter.max(LEAST_SCATTER_MM).powi(2);
-        let cell = |(at, s): (usize, &Sums)| {
+        let cell = |(at, s): (usize, &CellSums)| {
             (s[0] > 0.0 && s[0] >= full).then(|| Cell {
                 column: (first + at / rows[k] * columns.of_a_cell) % columns.around,
                 along_mm: course.along_mm(s[1] / s[0]),
@@ -220,13 +220,13 @@ fn of_shot(shot: &LabelledShot, view: &View, columns: &Columns, rows_mm: [f64; 2
 
 /// The columns that all cells lie in: around the whole seam, or from the end of the longest gap on where that is long. Returns
 /// where they begin, too.
-pub(super) fn line_of(columns: &Columns, walls: &[WallCells; 2]) -> (Line, usize) {
+pub(super) fn line_of(columns: &Columns, walls: &[WallCells; 2]) -> (SeamLine, usize) {
     let spacing_mm = columns.course.along_mm(columns.spacing());
     let mut used: Vec<usize> = walls.iter().flat_map(|w| w.cells.iter().map(|c| c.column)).collect();
     used.sort_unstable();
     used.dedup();
     let (Some(&low), Some(&high)) = (used.first(), used.last()) else {
-        return (Line { columns: 1, spacing_mm, closed: false }, 0);
+        return (SeamLine { columns: 1, spacing_mm, closed: false }, 0);
     };
     let (mut longest, mut start, mut end) = (low + columns.around - high, low, high);
     for pair in used.windows(2) {
@@ -235,12 +235,12 @@ pub(super) fn line_of(columns: &Columns, walls: &[WallCells; 2]) -> (Line, usize
         }
     }
     if (longest as f64) < OPEN_GAP * columns.around as f64 {
-        return (Line { columns: columns.around, spacing_mm, closed: true }, 0);
+        return (SeamLine { columns: columns.around, spacing_mm, closed: true }, 0);
     }
     // Bins reach a cell's half beyond its middle.
     let margin = columns.of_a_bin.max(columns.of_a_cell);
     (
-        Line { columns: end - start + 1 + 2 * margin, spacing_mm, closed: false },
+        SeamLine { columns: end - start + 1 + 2 * margin, spacing_mm, closed: false },
         (start + columns.around - margin) % columns.around,
     )
 }

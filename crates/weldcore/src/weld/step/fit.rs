@@ -5,7 +5,7 @@ use super::terms::Terms;
 use crate::error::{Error, Result};
 use crate::ground::threads;
 use crate::weld::kriging::{
-    Answer, Asked, Border, Cell, Columns as BorderColumns, Line, Prior, Reduced, Scales, Stretch, Wall, fit, fit_near,
+    Answer, Asked, Border, BorderColumns, Cell, KrigedWall, Prior, Reduced, Scales, SeamLine, Stretch, fit, fit_near,
     sweep,
 };
 
@@ -15,13 +15,13 @@ const SHOTS_FOR_SCALES: usize = 4;
 const ROWS_TO_SEAM: usize = 1;
 
 /// The equations of a seam: columns, border, walls.
-pub(super) struct Equations {
+pub(super) struct SeamEquations {
     pub columns: Columns,
-    pub line: Line,
+    pub line: SeamLine,
     /// The column around the seam that the line begins with.
     start: usize,
     pub terms: Terms,
-    pub walls: [Wall; 2],
+    pub walls: [KrigedWall; 2],
     border: [BorderColumns; 2],
     priors: [Prior; 2],
 }
@@ -36,7 +36,7 @@ pub(super) struct Solved {
     pub residuals: Vec<f64>,
 }
 
-impl Equations {
+impl SeamEquations {
     pub fn of(columns: Columns, gathered: &Gathered, terms: Terms) -> Self {
         let (line, start) = line_of(&columns, &gathered.walls);
         let border = [false, true].map(|other| terms.columns(other));
@@ -51,13 +51,13 @@ impl Equations {
         made
     }
 
-    fn wall(&self, other: bool, cells: &[Cell], rows_mm: Vec<f64>) -> Wall {
+    fn wall(&self, other: bool, cells: &[Cell], rows_mm: Vec<f64>) -> KrigedWall {
         let columns = &self.columns;
         let moved = cells.iter().filter_map(|c| {
             let column = (c.column + columns.around - self.start) % columns.around;
             (column < self.line.columns).then_some(Cell { column, ..*c })
         });
-        Wall::new(moved.collect(), self.terms.width(other), rows_mm, |cell, out| {
+        KrigedWall::new(moved.collect(), self.terms.width(other), rows_mm, |cell, out| {
             self.terms.row(other, cell, self.at(cell), out);
         })
     }
@@ -87,10 +87,10 @@ impl Equations {
         Self { walls, terms: self.terms.clone(), border: self.border.clone(), ..*self }
     }
 
-    fn rebuilt(&self, terms: &Terms, other: bool, keep: impl Fn(&Cell) -> bool) -> Wall {
+    fn rebuilt(&self, terms: &Terms, other: bool, keep: impl Fn(&Cell) -> bool) -> KrigedWall {
         let old = &self.walls[usize::from(other)];
         let cells = old.cells().iter().filter(|c| keep(c)).copied().collect();
-        Wall::new(cells, terms.width(other), old.rows_mm().to_vec(), |cell, out| {
+        KrigedWall::new(cells, terms.width(other), old.rows_mm().to_vec(), |cell, out| {
             terms.row(other, cell, self.at(cell), out);
         })
     }
@@ -131,7 +131,7 @@ impl Equations {
     fn telling(&self) -> Vec<usize> {
         let shots = self.terms.shots();
         let mut seen = vec![vec![false; self.line.columns]; shots];
-        for cell in self.walls.iter().flat_map(Wall::cells) {
+        for cell in self.walls.iter().flat_map(KrigedWall::cells) {
             seen[cell.shot][cell.column] = true;
         }
         let mut covered = vec![false; self.line.columns];
@@ -178,7 +178,7 @@ impl Equations {
         let walls = [(&reduced[0], &self.border[0]), (&reduced[1], &self.border[1])];
         let mut border =
             Border::join(self.terms.count(), &walls).ok_or_else(|| degenerate("its terms have no solution"))?;
-        border.make_plain(self.terms.optional(), self.walls.iter().map(Wall::count).sum());
+        border.make_plain(self.terms.optional(), self.walls.iter().map(KrigedWall::count).sum());
         let answer = border.answer(rows, &walls);
         if answer.value.iter().chain(&answer.covariance).any(|v| !v.is_finite()) {
             return Err(degenerate("the fit of the walls did not converge"));
@@ -192,8 +192,13 @@ fn degenerate(reason: &str) -> Error {
     Error::Degenerate { what: "step", reason: reason.into() }
 }
 
-fn empty() -> Wall {
-    Wall::new(Vec::new(), crate::weld::kriging::Width { common: 0, of_a_shot: 0, shots: 0 }, Vec::new(), |_, _| {})
+fn empty() -> KrigedWall {
+    KrigedWall::new(
+        Vec::new(),
+        crate::weld::kriging::Width { common: 0, of_a_shot: 0, shots: 0 },
+        Vec::new(),
+        |_, _| {},
+    )
 }
 
 /// The rows that carry a wall's unevenness: those of its cells, one towards the seam, and the seam.

@@ -4,7 +4,7 @@
 //! cap covers. So the walls are fitted without what lies nearest to the cap, with scales of their own, and what is nearest is
 //! predicted from that, bin by bin. Where it is not met, what the cap hides cannot be told from the walls.
 
-use super::fit::Equations;
+use super::fit::SeamEquations;
 use crate::error::Result;
 use crate::weld::kriging::{Asked, Cell, Scales};
 
@@ -37,7 +37,12 @@ impl Guard {
         Self { departures: vec![None; bins], scales }
     }
 
-    pub fn of(equations: &Equations, near: [Scales; 2], rows_mm: [f64; 2], reach_mm: [[f64; 2]; 2]) -> Result<Self> {
+    pub fn of(
+        equations: &SeamEquations,
+        near: [Scales; 2],
+        rows_mm: [f64; 2],
+        reach_mm: [[f64; 2]; 2],
+    ) -> Result<Self> {
         let limits: [f64; 2] = std::array::from_fn(|k| {
             let [from, to] = reach_mm[k];
             from + LEFT_OUT_MM.min(LEFT_OUT_PART * (to - from))

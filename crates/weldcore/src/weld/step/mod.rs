@@ -31,17 +31,17 @@ pub use bend::Modes;
 pub use profile::ProfileBin;
 pub use view::LabelledShot;
 
-use super::Course;
 use super::kriging::{Asked, Largest, Scales, largest};
+use super::seam::Course;
 use crate::error::{Error, Result, require_count};
 use crate::ground::memory::require;
 use bend::Bend;
 use cells::{Columns, gather};
-use fit::{Equations, Solved};
+use fit::{SeamEquations, Solved};
 use guard::Guard;
 use profile::{mean_and_median, slopes};
 use terms::Terms;
-use view::{View, common_seam};
+use view::{ShotView, common_seam};
 
 /// What the caller knows of further standard uncertainties (k = 1).
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -52,7 +52,7 @@ pub struct Known {
 
 /// A Fourier term of the step around the seam: cosine and sine, their standard uncertainties, and their prior's.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Wave {
+pub struct StepWave {
     /// How often it goes around.
     pub n: usize,
     /// Cosine and sine.
@@ -65,7 +65,7 @@ pub struct Wave {
 
 /// What a wall's unevenness is like.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Unevenness {
+pub struct FoundUnevenness {
     /// Standard deviation.
     pub sd_mm: f64,
     /// How far it reaches along and across the seam.
@@ -126,11 +126,11 @@ pub struct Step {
     /// Its standard uncertainty.
     pub tilt_standard_rad: f64,
     /// Further Fourier terms, n = 2 and up.
-    pub waves: Vec<Wave>,
+    pub waves: Vec<StepWave>,
     /// What the weld drew the reference wall and the other wall in by, each with its standard uncertainty.
     pub shrinkage_mm: [(f64, f64); 2],
     /// Of the reference wall and of the other wall.
-    pub unevenness: [Unevenness; 2],
+    pub unevenness: [FoundUnevenness; 2],
     /// Rms of the walls' cells about the terms that have a name: what unevenness and noise leave.
     pub residual_rms_mm: f64,
     /// Cells of both walls.
@@ -171,7 +171,7 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
     shots.iter().try_for_each(LabelledShot::check)?;
     require(shots.iter().map(|s| s.labels.len()).sum(), 24);
     let seam = common_seam(shots)?;
-    let views = shots.iter().map(|s| View::of(s, &seam)).collect::<Result<Vec<View>>>()?;
+    let views = shots.iter().map(|s| ShotView::of(s, &seam)).collect::<Result<Vec<ShotView>>>()?;
     let columns = Columns::of(seam.course);
     let gathered = gather(shots, &views, &columns)?;
     let thickness_mm = shots.iter().map(|s| s.thickness_mm).sum::<f64>() / shots.len() as f64;
@@ -184,7 +184,7 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
         return Err(Error::Shape { what: "calibration modes", expected, got });
     }
     let terms = Terms::new(seam.course, thickness_mm, views.iter().map(|v| v.middle).collect(), posed, bends);
-    let equations = Equations::of(columns, &gathered, terms);
+    let equations = SeamEquations::of(columns, &gathered, terms);
     let (rows_mm, reach_mm) =
         (gathered.walls.each_ref().map(|w| w.row_mm), gathered.walls.each_ref().map(|w| w.reach_mm));
     let bins: Vec<usize> =
@@ -197,16 +197,16 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
     // Walls too short to leave anything out are not told apart.
     let guard = Guard::of(&equations, near, rows_mm, reach_mm).unwrap_or_else(|_| Guard::none(bin_count, near));
     let (mut scales, mut solved) = (near, at_seam(&equations, &near, &bins, posed)?);
-    let mut found = Seen::of(&solved, &bins, &views, &seam.course, known)?;
+    let mut found = Uncertain::of(&solved, &bins, &views, &seam.course, known)?;
     let departure_limit = Guard::limit(found.largest.band_factor);
     if guard.departures.iter().flatten().any(|z| z.abs() > departure_limit) {
         // What lies beside the cap must not say what is usual.
         scales = guard.scales;
         solved = at_seam(&equations, &scales, &bins, posed)?;
-        found = Seen::of(&solved, &bins, &views, &seam.course, known)?;
+        found = Uncertain::of(&solved, &bins, &views, &seam.course, known)?;
     }
     let Solved { border, answer, terms, residuals } = &solved;
-    let Seen { covariance_mm2, place_mm, largest } = found;
+    let Uncertain { covariance_mm2, place_mm, largest } = found;
 
     let course = seam.course;
     let n = bins.len();
@@ -249,7 +249,7 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
         (pair(terms.offset_rows()), pair(terms.lean_rows()));
     let waves = terms.round_rows().map(|(n, rows, prior_mm)| {
         let [c, s] = rows.map(|r| told(&r));
-        Wave { n, amplitude_mm: [c.0, s.0], standard_mm: [c.1, s.1], prior_mm }
+        StepWave { n, amplitude_mm: [c.0, s.0], standard_mm: [c.1, s.1], prior_mm }
     });
     let mean_variance = covariance_mm2.iter().sum::<f64>() / (n * n) as f64;
     Ok(Step {
@@ -265,7 +265,11 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
         tilt_standard_rad,
         waves: waves.collect(),
         shrinkage_mm: terms.drawn_rows().map(|row| told(&row)),
-        unevenness: scales.map(|s| Unevenness { sd_mm: s.sd_mm, reach_mm: [s.along_mm, s.across_mm], noise: s.noise }),
+        unevenness: scales.map(|s| FoundUnevenness {
+            sd_mm: s.sd_mm,
+            reach_mm: [s.along_mm, s.across_mm],
+            noise: s.noise,
+        }),
         residual_rms_mm: (residuals.iter().map(|r| r * r).sum::<f64>() / residuals.len() as f64).sqrt(),
         cells: residuals.len(),
         covariance_mm2,
@@ -276,20 +280,20 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
 }
 
 /// What is uncertain of the profile.
-struct Seen {
+struct Uncertain {
     covariance_mm2: Vec<f64>,
     /// Of each bin, what is not known of its place along the seam makes of it.
     place_mm: Vec<f64>,
     largest: LargestStep,
 }
 
-impl Seen {
+impl Uncertain {
     /// Adds to the walls' covariance what a shift along the seam does: of all bins together by what the caller knows, of a shot's
     /// bins by what that shot's place leaves open.
-    fn of(solved: &Solved, bins: &[usize], views: &[View], course: &Course, known: &Known) -> Result<Self> {
+    fn of(solved: &Solved, bins: &[usize], views: &[ShotView], course: &Course, known: &Known) -> Result<Self> {
         let (n, value) = (bins.len(), &solved.answer.value);
         let slopes = slopes(bins, course.bins(), course.at_reading(course.bin_width()), value);
-        let apart = |bin: usize, view: &View| course.apart(course.bin_middle(bin), view.middle).abs();
+        let apart = |bin: usize, view: &ShotView| course.apart(course.bin_middle(bin), view.middle).abs();
         let nearest = |bin: &usize| {
             let by_place = |a: &usize, b: &usize| apart(*bin, &views[*a]).total_cmp(&apart(*bin, &views[*b]));
             (0..views.len()).min_by(by_place).unwrap_or(0)
@@ -316,8 +320,8 @@ impl Seen {
 }
 
 /// The step at the middles of bins. Several shots turn about the axis: by what the walls found in a first pass are like.
-fn at_seam(equations: &Equations, scales: &[Scales; 2], bins: &[usize], posed: bool) -> Result<Solved> {
-    let solve = |equations: &Equations, bins: &[usize]| {
+fn at_seam(equations: &SeamEquations, scales: &[Scales; 2], bins: &[usize], posed: bool) -> Result<Solved> {
+    let solve = |equations: &SeamEquations, bins: &[usize]| {
         let column = |bin: &usize| equations.column_of_bin(*bin).unwrap_or(0);
         let ask = |factor: f64| -> Vec<Asked> {
             bins.iter().map(|bin| Asked { column: column(bin), across_mm: 0.0, factor }).collect()

@@ -6,7 +6,7 @@ use crate::ground::robust::median;
 /// One bin of the profile along the seam.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ProfileBin {
-    /// Its middle, as a reading ([`crate::weld::Course::reading`]).
+    /// Its middle, as a reading (`Course::reading`).
     pub along: f64,
     /// Both walls as they are at the seam's centreline.
     pub step_mm: f64,

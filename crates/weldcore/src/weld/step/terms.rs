@@ -143,8 +143,8 @@ impl Terms {
     }
 
     /// Which unknowns each column of a wall is the sum of.
-    pub fn columns(&self, other: bool) -> kriging::Columns {
-        let mut columns: kriging::Columns = Vec::new();
+    pub fn columns(&self, other: bool) -> kriging::BorderColumns {
+        let mut columns: kriging::BorderColumns = Vec::new();
         if other {
             columns.extend((0..STEP_ROUND).map(|k| vec![k]));
             columns.extend((0..ROUND).map(|k| vec![STEP_ROUND + k, REFERENCE_ROUND + k]));

@@ -2,8 +2,8 @@
 
 use super::*;
 use crate::ground::threads;
-use crate::weld::Course;
 use crate::weld::label::Label;
+use crate::weld::seam::Course;
 use crate::weld::segment::tests::{COLUMNS, EXAMPLE, Example, MIDDLE_RAD, normal_random};
 use crate::weld::segment::{Segmentation, segment};
 

@@ -95,7 +95,7 @@ fn in_base(seam: &Seam, base_from_scanner: &Transform) -> Result<Seam> {
 
 /// One shot about the common seam.
 #[derive(Debug, Clone)]
-pub(super) struct View {
+pub(super) struct ShotView {
     pub course: Course,
     /// The stretch of the seam that was seen of the walls, about the common seam.
     pub middle: f64,
@@ -109,7 +109,7 @@ pub(super) struct View {
     pub reach_mm: [[f64; 2]; 2],
 }
 
-impl View {
+impl ShotView {
     /// # Errors
     /// [`Error::TooFew`] without both walls, [`Error::Degenerate`] where all points lie at one place.
     pub fn of(shot: &LabelledShot, common: &Seam) -> Result<Self> {

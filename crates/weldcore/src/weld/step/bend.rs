@@ -6,23 +6,12 @@
 
 use nalgebra::DMatrix;
 
-use super::view::{LabelledShot, ShotView};
+use super::view::{LabelledShot, Modes, SeamView};
 use crate::error::{Error, Result, require_count};
 
 /// Of the polynomial: a lens' fifth-order distortion over a view.
 const DEGREE: usize = 5;
 const TERMS: usize = (DEGREE + 1) * (DEGREE + 2) / 2;
-
-/// What is known of a shot's modes: points, by their number in it, and a row of all modes for each, mm.
-#[derive(Debug, Clone, Copy)]
-pub struct Modes<'a> {
-    /// Numbers of points of the shot.
-    pub points: &'a [usize],
-    /// Of each, a row of all modes.
-    pub deviation_mm: &'a [f64],
-    /// How many modes there are.
-    pub count: usize,
-}
 
 /// The modes of one shot, over its view.
 #[derive(Debug, Clone)]
@@ -37,7 +26,7 @@ pub(super) struct Bend {
 impl Bend {
     /// # Errors
     /// [`Error::Shape`] where points and rows do not agree, [`Error::TooFew`] where the points do not tell a polynomial.
-    pub fn of(shot: &LabelledShot, view: &ShotView) -> Result<Option<Self>> {
+    pub fn of(shot: &LabelledShot, view: &SeamView) -> Result<Option<Self>> {
         let Some(Modes { points, deviation_mm, count }) = shot.modes else { return Ok(None) };
         let known = points.len();
         if deviation_mm.len() != known * count || points.iter().any(|&i| i >= shot.labels.len()) {

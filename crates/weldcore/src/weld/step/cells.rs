@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::view::{LabelledShot, ShotView, is_wall};
+use super::view::{LabelledShot, SeamView, is_wall};
 use crate::error::{Error, Result, require_count};
 use crate::ground::robust::median;
 use crate::ground::stop::polled;
@@ -116,7 +116,7 @@ pub(super) struct Gathered {
 /// A bin counts as seen when each wall has this part of the points of a typical bin: edges of the view fill bins partly.
 const SEEN_PART: f64 = 0.1;
 
-pub(super) fn gather(shots: &[LabelledShot], views: &[ShotView], columns: &Columns) -> Result<Gathered> {
+pub(super) fn gather(shots: &[LabelledShot], views: &[SeamView], columns: &Columns) -> Result<Gathered> {
     // The rows are common to all shots.
     let mut reach = [[f64::INFINITY, 0.0_f64]; 2];
     for view in views {
@@ -154,7 +154,7 @@ struct OfShot {
     typical: [f64; 2],
 }
 
-fn of_shot(shot: &LabelledShot, view: &ShotView, columns: &Columns, rows_mm: [f64; 2], reach: [[f64; 2]; 2]) -> OfShot {
+fn of_shot(shot: &LabelledShot, view: &SeamView, columns: &Columns, rows_mm: [f64; 2], reach: [[f64; 2]; 2]) -> OfShot {
     let course = columns.course;
     // Cells along the stretch of this shot alone, from its first one on.
     let cell_at = columns.spacing() * columns.of_a_cell as f64;

@@ -27,9 +27,8 @@ mod terms;
 mod tests;
 mod view;
 
-pub use bend::Modes;
 pub use profile::ProfileBin;
-pub use view::LabelledShot;
+pub use view::{LabelledShot, Modes};
 
 use super::kriging::{Asked, Largest, Scales, largest};
 use super::seam::Course;
@@ -41,7 +40,7 @@ use fit::{SeamEquations, Solved};
 use guard::Guard;
 use profile::{mean_and_median, slopes};
 use terms::Terms;
-use view::{ShotView, common_seam};
+use view::{SeamView, common_seam};
 
 /// What the caller knows of further standard uncertainties (k = 1).
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -171,7 +170,7 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
     shots.iter().try_for_each(LabelledShot::check)?;
     require(shots.iter().map(|s| s.labels.len()).sum(), 24);
     let seam = common_seam(shots)?;
-    let views = shots.iter().map(|s| ShotView::of(s, &seam)).collect::<Result<Vec<ShotView>>>()?;
+    let views = shots.iter().map(|s| SeamView::of(s, &seam)).collect::<Result<Vec<SeamView>>>()?;
     let columns = Columns::of(seam.course);
     let gathered = gather(shots, &views, &columns)?;
     let thickness_mm = shots.iter().map(|s| s.thickness_mm).sum::<f64>() / shots.len() as f64;
@@ -290,10 +289,10 @@ struct Uncertain {
 impl Uncertain {
     /// Adds to the walls' covariance what a shift along the seam does: of all bins together by what the caller knows, of a shot's
     /// bins by what that shot's place leaves open.
-    fn of(solved: &Solved, bins: &[usize], views: &[ShotView], course: &Course, known: &Known) -> Result<Self> {
+    fn of(solved: &Solved, bins: &[usize], views: &[SeamView], course: &Course, known: &Known) -> Result<Self> {
         let (n, value) = (bins.len(), &solved.answer.value);
         let slopes = slopes(bins, course.bins(), course.at_reading(course.bin_width()), value);
-        let apart = |bin: usize, view: &ShotView| course.apart(course.bin_middle(bin), view.middle).abs();
+        let apart = |bin: usize, view: &SeamView| course.apart(course.bin_middle(bin), view.middle).abs();
         let nearest = |bin: &usize| {
             let by_place = |a: &usize, b: &usize| apart(*bin, &views[*a]).total_cmp(&apart(*bin, &views[*b]));
             (0..views.len()).min_by(by_place).unwrap_or(0)

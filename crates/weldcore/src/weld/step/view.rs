@@ -1,6 +1,5 @@
 //! The shots of one seam in one frame: a common axis and zero mark, and where each shot's points lie about them.
 
-use super::bend::Modes;
 use crate::error::{Error, Result, require_count, require_positive};
 use crate::ground::threads;
 use crate::ground::transform::{Transform, Vec3};
@@ -13,6 +12,17 @@ const MIDDLE_STRIDE: usize = 16;
 const AXIS_POINTS: usize = 8000;
 /// Intervals of a shot's table along its stretch: what it holds is smooth, and straight in between to 1e-7 of its size.
 const TABLE: usize = 1024;
+
+/// What is known of a shot's modes: points, by their number in it, and a row of all modes for each, mm.
+#[derive(Debug, Clone, Copy)]
+pub struct Modes<'a> {
+    /// Numbers of points of the shot.
+    pub points: &'a [usize],
+    /// Of each, a row of all modes.
+    pub deviation_mm: &'a [f64],
+    /// How many modes there are.
+    pub count: usize,
+}
 
 /// One shot, unrolled and labelled (see [`crate::weld::segment`]).
 #[derive(Debug, Clone, Copy)]
@@ -95,7 +105,7 @@ fn in_base(seam: &Seam, base_from_scanner: &Transform) -> Result<Seam> {
 
 /// One shot about the common seam.
 #[derive(Debug, Clone)]
-pub(super) struct ShotView {
+pub(super) struct SeamView {
     pub course: Course,
     /// The stretch of the seam that was seen of the walls, about the common seam.
     pub middle: f64,
@@ -109,7 +119,7 @@ pub(super) struct ShotView {
     pub reach_mm: [[f64; 2]; 2],
 }
 
-impl ShotView {
+impl SeamView {
     /// # Errors
     /// [`Error::TooFew`] without both walls, [`Error::Degenerate`] where all points lie at one place.
     pub fn of(shot: &LabelledShot, common: &Seam) -> Result<Self> {

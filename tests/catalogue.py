@@ -423,9 +423,23 @@ def _(scale: float) -> Job:
 
 @job("place_shots")
 def _(scale: float) -> Job:
-    points = weld_shot(4 * scale)
-    shot = ws.segment_weld(points, 315.0, 6.0)
-    return lambda: ws.place_shots([(shot, points, np.eye(4), shot.deviation_mm, 1)] * 2)
+    shot = ws.segment_weld(weld_shot(4 * scale), 315.0, 6.0)
+    step = ws.measure_step([shot] * 2)
+    return lambda: ws.place_shots(step, [(shot, np.eye(4), 1)] * 2, 0.3)
+
+
+@job("WeldStep.alone")
+def _(scale: float) -> Job:
+    shot = ws.segment_weld(weld_shot(4 * scale), 315.0, 6.0)
+    step = ws.measure_step([shot])
+    return lambda: step.alone(shot)
+
+
+@job("WeldStep.deviation_of")
+def _(scale: float) -> Job:
+    shot = ws.segment_weld(weld_shot(4 * scale), 315.0, 6.0)
+    step = ws.measure_step([shot])
+    return lambda: step.deviation_of(shot, 0)
 
 
 # --- simulation

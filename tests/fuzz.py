@@ -267,8 +267,8 @@ def segmentation(rng: Random) -> Arguments:
 
 
 def placing(rng: Random) -> Arguments:
-    one = (weld_shot(), weld_points(), pose(rng), weld_shot().deviation_mm, few(rng))
-    return {"shots": [one] * few(rng, 3)}
+    size = [None, 0.5, 0.0, np.nan][rng.integers(4)]
+    return {"step": weld_step(), "shots": [(weld_shot(), pose(rng), few(rng))] * few(rng, 3), "cell_mm": size}
 
 
 def png(rng: Random) -> Arguments:

@@ -238,15 +238,20 @@ def test_placed_points_are_the_shots_points_moved_by_hand():
     shot = ws.segment_weld(points, 315.0, 6.0)
     rng = np.random.default_rng(1)
     transforms = [pose(rng), pose(rng)]
-    placed, label, deviation, angle_deg, axial, number = ws.place_shots(
-        [(shot, points, t, shot.deviation_mm, 4 + i) for i, t in enumerate(transforms)]
+    step = ws.measure_step([shot, shot])
+    placed, label, deviation, angle_deg, axial, number, counts = ws.place_shots(
+        step, [(shot, t, 4 + i) for i, t in enumerate(transforms)]
     )
     kept = np.isfinite(shot.deviation_mm)
     assert 0 < kept.sum() < kept.size
     flat = points.reshape(-1, 3)[kept]
-    assert np.abs(placed - np.vstack([moved(flat, t) for t in transforms])).max() < 1e-9
+    # The shot keeps its points in single precision.
+    assert np.abs(placed - np.vstack([moved(flat, t) for t in transforms])).max() < 1e-4
+    assert np.abs(shot.points_mm(np.flatnonzero(kept)) - flat).max() < 1e-4
+    assert counts == (2 * np.bincount(shot.labels[kept], minlength=5)).tolist()
     assert np.array_equal(label, np.tile(shot.labels[kept], 2))
-    assert np.array_equal(deviation, np.tile(shot.deviation_mm[kept], 2))
+    each = [step.deviation_of(shot, k) for k in range(2)]
+    assert np.array_equal(deviation, np.concatenate([d[kept] for d in each]))
     assert np.array_equal(axial, np.tile(shot.axial_mm[kept], 2))
     assert np.allclose(np.cos(np.radians(angle_deg)), np.cos(np.tile(shot.angle_rad[kept], 2)), atol=1e-5)
     assert np.array_equal(number, np.repeat([4, 5], kept.sum()))

@@ -56,8 +56,9 @@ def view_of(distance_mm: float = DISTANCE_MM, stride: int = 6) -> PartView:
         zero=zero,
         radius_mm=RADIUS_MM,
         noise_mm=0.03,
+        points_mm=lambda at: points.reshape(-1, 3)[at],
     )
-    return PartView("part-1", 0, points.reshape(*u.shape, 3), np.zeros(u.shape, np.uint8), np.eye(4), np.eye(4), shot)
+    return PartView("part-1", 0, np.zeros(u.shape, np.uint8), np.eye(4), np.eye(4), shot)
 
 
 ANGLES = np.array([-8.0, 0.0, 8.0])
@@ -77,11 +78,12 @@ def moved(scanner: Scanner, by: np.ndarray) -> Scanner:
 def test_the_step_moves_as_a_wrong_scanner_moves_it():
     # Every pixel of the camera, triangulated with another scanner, and the walls fitted from the points.
     view = view_of(stride=1)
-    column = SCANNER.project_to_projector(view.points_mm.reshape(-1, 3))[:, 0].reshape(view.reason.shape)
+    points = view.shot.points_mm(np.arange(view.reason.size))
+    column = SCANNER.project_to_projector(points)[:, 0].reshape(view.reason.shape)
     covariance = nominal_covariance(SCANNER, DISTANCE_MM)
     values, vectors = np.linalg.eigh(covariance)
     by = vectors @ (np.sqrt(np.maximum(values, 0)) * np.random.default_rng(3).normal(size=24))
-    shift = triangulate(column, moved(SCANNER, by)).points_mm - view.points_mm
+    shift = triangulate(column, moved(SCANNER, by)).points_mm - points.reshape(*view.reason.shape, 3)
     shot = view.shot
     walls = np.flatnonzero((shot.labels != Label.BEAD) & np.isfinite(shift[..., 0].ravel()))[::7]
     angle, z = shot.angle_rad[walls], shot.axial_mm[walls] / 100

@@ -36,7 +36,8 @@ def test_a_hard_session_does_not_pass_and_says_why(name):
     assert MUST_NOT_PASS[name] <= {bar.code for bar in found.bars}
     if found.verdict is Verdict.FAIL:
         assert found.step.max_abs_mm - found.step.expanded_uncertainty_mm > truth["limit_mm"]
-    if found.step.judged == "edge":
+    # What lies in the dark is not there to be covered.
+    if found.step.judged == "edge" and truth["largest_at_deg"] in found.step.angle_deg:
         assert abs(found.step.max_abs_mm - truth["largest"]) <= found.step.expanded_uncertainty_mm + 0.02
 
 

@@ -191,7 +191,8 @@ def stated_covariance(spec: ScannerSpec) -> Floats | None:
 
 def part_distance_mm(views: Sequence[PartView]) -> float:
     """How far the part is from the camera: median over the views' points, every so many of them."""
-    depths = np.concatenate([view.points_mm[::DEPTH_STRIDE, ::DEPTH_STRIDE, 2].ravel() for view in views])
+    some = (np.arange(0, view.reason.size, DEPTH_STRIDE**2) for view in views)
+    depths = np.concatenate([view.shot.points_mm(at)[:, 2] for view, at in zip(views, some, strict=True)])
     known = depths[np.isfinite(depths)]
     return float(np.median(known)) if len(known) else math.nan
 
@@ -328,7 +329,7 @@ def step_jacobians(
         for at, is_other in zip(walls, (0.0, 1.0), strict=True):
             angle, along = shot.angle_rad.ravel()[at].astype(float), shot.axial_mm.ravel()[at].astype(float)
             normal = np.outer(np.cos(angle), shot.zero) + np.outer(np.sin(angle), np.cross(shot.axis, shot.zero))
-            moved = np.einsum("ni,nij->nj", normal, point_jacobian(model, view.points_mm.reshape(-1, 3)[at], axis))
+            moved = np.einsum("ni,nij->nj", normal, point_jacobian(model, shot.points_mm(at), axis))
             cylinder = _cylinder(angle, along / shot.radius_mm)
             drawn = _shell(along, shot.radius_mm, wall_mm)[:, None]
             columns = [cylinder, is_other * cylinder, (1 - is_other) * drawn, is_other * drawn, moved]

@@ -51,7 +51,7 @@ def calibration_unknowns(
     for view, at in zip(views, numbers, strict=True):
         shot, angle = view.shot, view.shot.angle_rad.ravel()[at].astype(float)
         normal = np.outer(np.cos(angle), shot.zero) + np.outer(np.sin(angle), np.cross(shot.axis, shot.zero))
-        modes.append(deviation_modes(scanner, root, view.points_mm.reshape(-1, 3)[at], normal, axis))
+        modes.append(deviation_modes(scanner, root, shot.points_mm(at), normal, axis))
     # Turned so that the first ones move most: unknowns of unit variance stay such.
     together = np.concatenate(modes)
     _, strength, turn = np.linalg.svd(together, full_matrices=False)

@@ -37,7 +37,7 @@ from weldscan.measure.scanner_standing import standing_of
 from weldscan.measure.seam_coverage import EdgeProfile, Seam, edge_profile, seam_of
 from weldscan.measure.session_hand_eye import base_from_flange, hand_eye_of
 from weldscan.measure.session_points import Compensate, PointReader, Progress
-from weldscan.measure.shot_agreement import PlacedShot, agreement, complaint, copies, shots_agree
+from weldscan.measure.shot_agreement import agreement, complaint, copies, shots_agree
 from weldscan.measure.stated_and_found import (
     held_against_itself,
     held_against_record,
@@ -70,6 +70,9 @@ from weldscan.result import (
 Floats = NDArray[np.float64]
 DEFAULT_NORMS = ("pnae-g-7-010-89",)
 METHODS = ("surface", "paper")
+CLOUDS = ("cells", "all")
+# By contract: beyond so many placed points the cloud holds one of every cell of this size.
+MOST_POINTS, CELL_MM = 4_000_000, 0.15
 ReaderOf = Callable[[Session, Progress | None, Compensate], PointReader]
 
 
@@ -82,6 +85,7 @@ def inspect(
     accept_verification: str | None = None,
     response: str | os.PathLike[str] | Response = "auto",
     required_coverage_deg: float | None = None,
+    cloud: str = "cells",
     progress: Progress | None = None,
     reader: ReaderOf = PointReader,
 ) -> Inspection:
@@ -99,6 +103,8 @@ def inspect(
             not corrected.
         required_coverage_deg: how much of the seam must be seen for a PASS, 360 for all of it; by default what the
             session's `part.required_coverage_deg` says.
+        cloud: `all`: every point that was measured is in `Inspection.cloud`; `cells`: of more than 4 million one of every cell
+            of 0.15 mm of the unrolled part, that of the first shot that saw it.
         progress: called with (done, total, what) while it works.
         reader: makes what turns a shot into points, from the session, `progress` and what to do about the response: by
             default from the shot's images.
@@ -119,7 +125,9 @@ def inspect(
         >>> abs(result.step.max_abs_mm - abs(truth["step_mm"]["max_abs"])) < result.step.expanded_uncertainty_mm
         True
     """
-    run = _Run(folder, method, norms, response, progress, history, accept_verification, required_coverage_deg, reader)
+    run = _Run(
+        folder, method, norms, response, progress, history, accept_verification, required_coverage_deg, cloud, reader
+    )
     noticed = run.noticed
     # 1-4  the three-sphere plate in every artefact shot: where the scanner sits on the flange
     hand_eye, more = hand_eye_of(run.read, run.unusable)
@@ -159,8 +167,12 @@ class _Run:
         history: str | os.PathLike[str] | None,
         accept_verification: str | None,
         required_coverage_deg: float | None,
+        cloud: str,
         reader: ReaderOf,
     ) -> None:
+        if cloud not in CLOUDS:
+            raise InputError(f"cloud: must be one of {', '.join(CLOUDS)}, got {cloud!r}")
+        self.cloud = cloud
         if method not in METHODS:
             raise InputError(f"method: must be one of {', '.join(METHODS)}, got {method!r}")
         if required_coverage_deg is not None and not 0 < required_coverage_deg <= WHOLE_TURN_DEG:
@@ -226,7 +238,6 @@ class _Run:
         view = PartView(
             shot.name,
             self.session.part_shots.index(shot),
-            scan.points_mm,
             scan.reason,
             base_from_flange(shot) if self.session.has_robot else np.eye(4),
             base_from_scanner,
@@ -277,17 +288,12 @@ class _Run:
                 self.read.axis,
             )
         noticed, t = noticed + Journal(seam.findings) + took("seam", t), time.perf_counter()
-        deviations = step.deviation_mm
-        cloud = PartCloud(
-            *place_shots(
-                [(v.shot, v.points_mm, v.base_from_scanner, d, v.index) for v, d in zip(views, deviations, strict=True)]
-            )
-        )
-        noticed, t = noticed + took("place", t), time.perf_counter()
         agreements: tuple[ShotAgreement, ...] = ()
         if hand_eye is not None and len(views) > 1:
-            agreements, said = self.hold_together(cloud, views, hand_eye)
+            agreements, said = self.hold_together(views, step, hand_eye)
             noticed, t = noticed + Journal(said) + took("agreement", t), time.perf_counter()
+        cloud = self.placed(views, step)
+        noticed, t = noticed + took("place", t), time.perf_counter()
         histogram, said = self.paper(cloud, views[0])
         noticed += Journal(said) + took("paper", t)
         if not found.angle_deg.size:
@@ -313,15 +319,20 @@ class _Run:
         asked = self.required_coverage_deg
         return self.part.required_coverage_deg if asked is None else asked
 
+    def placed(self, views: Sequence[PartView], step: WeldStep) -> PartCloud:
+        """All shots in base, in one cloud."""
+        shots = [(view.shot, view.base_from_scanner, view.index) for view in views]
+        many = sum(int(np.count_nonzero(np.isfinite(view.shot.deviation_mm))) for view in views) > MOST_POINTS
+        *arrays, counts = place_shots(step, shots, CELL_MM if many and self.cloud == "cells" else None)
+        return PartCloud(*arrays, tuple(counts))
+
     def hold_together(
-        self, cloud: PartCloud, views: Sequence[PartView], hand_eye: HandEye
+        self, views: Sequence[PartView], step: WeldStep, hand_eye: HandEye
     ) -> tuple[tuple[ShotAgreement, ...], tuple[Finding, ...]]:
         """Shots that saw the same wall, held against each other in base."""
-        shots = [(view.index, self.session.part_shots[view.index]) for view in views]
-        placed = [PlacedShot(shot.name, index, base_from_flange(shot)) for index, shot in shots]
-        pairs = agreement(cloud, placed, hand_eye, views[0].seam_in_base)
+        pairs = agreement(views, hand_eye, views[0].seam_in_base)
         said = [said for pair in pairs if (said := complaint(pair)) is not None]
-        return pairs, (*said, *shots_agree(views, hand_eye, self.part.wall_thickness))
+        return pairs, (*said, *shots_agree(views, step, hand_eye, self.part.wall_thickness))
 
     def paper(self, cloud: PartCloud, view: PartView) -> tuple[Histogram | None, tuple[Finding, ...]]:
         """The paper's chain; None with a note where it finds no answer."""

@@ -23,8 +23,6 @@ class PartView:
     name: str
     index: int
     """Among the session's part shots."""
-    points_mm: Floats
-    """(H, W, 3), scanner frame, NaN where there is none."""
     reason: NDArray[np.uint8]
     """(H, W): why a pixel has no point, as `PhaseMap.reason` says it."""
     base_from_flange: Floats
@@ -32,6 +30,7 @@ class PartView:
     base_from_scanner: Floats
     """(4, 4); the identity without a robot."""
     shot: WeldShot
+    """Which keeps the points, too."""
     hull: CalibratedHull | None = None
     """Where the scanner is calibrated: what lies outside was masked; None: not known."""
 

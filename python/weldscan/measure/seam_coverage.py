@@ -105,10 +105,8 @@ def edge_profile(views: Sequence[PartView]) -> EdgeProfile:
     course = views[0].shot.seam.course
     shots = [_EdgesOfShot.of(view) for view in views]
     step, u, departure = np.full(course.bins, np.nan), np.full(course.bins, np.nan), np.zeros(course.bins)
-    for k in range(course.bins):
+    for k in sorted({k for shot in shots for k in shot.by_bin}):
         read, expanded, off = (np.concatenate(columns) for columns in zip(*_read_of_bin(shots, k), strict=True))
-        if not len(read):
-            continue
         worst = int(np.argmax(np.abs(read) + expanded))
         # The worst of several is further off than any single one's uncertainty says.
         chosen = abs(float(read[worst] - np.median(read)))
@@ -191,12 +189,8 @@ def _stations_by_bin(view: PartView) -> dict[int, NDArray[np.intp]]:
     shot, course = view.shot, view.shot.seam.course
     readings = shot.sections["along"]
     half = course.bin_width / 2 + course.reading_of_mm(shot.station_mm / 2)
-    found = {}
-    for k in range(course.bins):
-        near = np.flatnonzero(np.abs(course.apart(readings, course.bin_width * k)) < half)
-        if len(near):
-            found[k] = near
-    return found
+    off = [np.abs(course.apart(readings, course.bin_width * k)) < half for k in range(course.bins)]
+    return {k: np.flatnonzero(near) for k, near in enumerate(off) if near.any()}
 
 
 def expected_bins(views: Sequence[PartView], scanner: Scanner) -> set[int]:

@@ -22,16 +22,18 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from weldscan._weldcore import SeamCourse, SeamFrame, measure_step, wall_differences, wall_seen
+from weldscan._weldcore import SeamCourse, SeamFrame, WeldStep, wall_differences, wall_seen
 from weldscan.calibration.hand_eye import LARGEST_RESIDUAL_MM, pose_sigma
 from weldscan.errors import GeometryError
 from weldscan.geometry import skew
 from weldscan.measure.part_views import PartView
-from weldscan.measure.seam_coverage import edge_profile
-from weldscan.result import Finding, HandEye, Label, PartCloud, Severity, ShotAgreement, bar, warning
+from weldscan.measure.seam_coverage import EdgeProfile, edge_profile
+from weldscan.result import Finding, HandEye, Label, Severity, ShotAgreement, bar, warning
 
 Floats = NDArray[np.float64]
 
+# Points of a shot's walls that are compared: tens in every cell of 4 mm.
+WALL_POINTS = 30_000
 # Neighbouring cells share the scanner's errors: about so many count as one.
 CORRELATED_CELLS = 4
 # Two shots, each placed as wrong as no industrial arm stands.
@@ -75,28 +77,26 @@ class PlacedShot:
     """Where a part shot was taken from."""
 
     name: str
-    index: int
-    """In `PartCloud.shot`."""
     base_from_flange: Floats
 
 
-def agreement(
-    cloud: PartCloud, shots: Sequence[PlacedShot], hand_eye: HandEye, seam: SeamFrame
-) -> tuple[ShotAgreement, ...]:
+def agreement(views: Sequence[PartView], hand_eye: HandEye, seam: SeamFrame) -> tuple[ShotAgreement, ...]:
     """The difference in height between every two shots where both saw a wall, with its uncertainty.
 
     Args:
-        cloud: all points in base.
-        shots: of the cloud.
+        views: the segmented part shots.
         hand_eye: through which they were placed.
         seam: of one of them, in base.
 
     Returns:
         One per pair that saw a wall together in 20 cells of 4 mm or more.
     """
-    origin_mm, axis = seam.origin_mm, seam.across
+    sampled = [_walls_of(view) for view in views]
+    points_mm, labels = (np.concatenate(columns) for columns in zip(*sampled, strict=True))
+    numbers = np.repeat(np.arange(len(views), dtype=np.uint16), [len(label) for _, label in sampled])
+    shots = [PlacedShot(view.name, view.base_from_flange) for view in views]
     found = []
-    pairs = wall_differences(cloud.points_mm, cloud.label, cloud.shot, [shot.index for shot in shots], origin_mm, axis)
+    pairs = wall_differences(points_mm, labels, numbers, range(len(views)), seam.origin_mm, seam.across)
     for i, j, cells, difference_mm, scatter_mm, rms_mm, middle in pairs:
         normal = seam.outward(seam.place(middle[None])[0])[0]
         placing = _placing_mm([shots[i], shots[j]], hand_eye, middle, normal)
@@ -110,6 +110,15 @@ def agreement(
             )
         )
     return tuple(found)
+
+
+def _walls_of(view: PartView) -> tuple[Floats, NDArray[np.uint8]]:
+    """Points of a view's walls in base, and their labels: so many of them that more would change nothing."""
+    labels = view.shot.labels.ravel()
+    walls = np.flatnonzero((labels == Label.REFERENCE_WALL) | (labels == Label.OTHER_WALL))
+    some = walls[:: max(1, len(walls) // WALL_POINTS)]
+    turn, place = view.base_from_scanner[:3, :3], view.base_from_scanner[:3, 3]
+    return view.shot.points_mm(some) @ turn.T + place, labels[some]
 
 
 def complaint(pair: ShotAgreement) -> Finding | None:
@@ -159,11 +168,14 @@ def copies(digests: Mapping[str, str]) -> list[Finding]:
 # --- the pipe and the step, shot by shot ------------------------------------------------------------------------------
 
 
-def shots_agree(views: Sequence[PartView], hand_eye: HandEye, thickness_mm: float = math.inf) -> list[Finding]:
+def shots_agree(
+    views: Sequence[PartView], step: WeldStep, hand_eye: HandEye, thickness_mm: float = math.inf
+) -> list[Finding]:
     """Whether the shots are of one pipe that stood still.
 
     Args:
         views: the segmented part shots.
+        step: as all of them tell it together.
         hand_eye: through which they were placed.
         thickness_mm: of the wall: what two shots may read differently is little beside what it is allowed.
 
@@ -177,7 +189,7 @@ def shots_agree(views: Sequence[PartView], hand_eye: HandEye, thickness_mm: floa
         for i, j in combinations(range(len(seen)), 2)
         if (complaints := list(_misplaced(seen[i], seen[j], hand_eye)))
     }
-    return [*_about_places(views, misplaced), *_stepped_alike(views, hand_eye, set(misplaced), thickness_mm)]
+    return [*_about_places(views, misplaced), *_stepped_alike(views, step, hand_eye, set(misplaced), thickness_mm)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +261,7 @@ def _misplaced(one: _Seen, other: _Seen, hand_eye: HandEye) -> Iterator[str]:
     """What two shots say differently of where the pipe is, beyond what a real pipe and a real robot do."""
     axis = one.axis + other.axis
     axis /= np.linalg.norm(axis)
-    shots = [PlacedShot(s.view.name, s.view.index, s.view.base_from_flange) for s in (one, other)]
+    shots = [PlacedShot(s.view.name, s.view.base_from_flange) for s in (one, other)]
     middle = (one.seam_mm + other.seam_mm) / 2
     turned = np.eye(3) * _turning_rad(hand_eye) ** 2
     # To where it runs.
@@ -288,7 +300,7 @@ def _turning_rad(hand_eye: HandEye) -> float:
 
 
 def _stepped_alike(
-    views: Sequence[PartView], hand_eye: HandEye, not_these: set[tuple[int, int]], thickness_mm: float
+    views: Sequence[PartView], step: WeldStep, hand_eye: HandEye, not_these: set[tuple[int, int]], thickness_mm: float
 ) -> list[Finding]:
     """The step of each shot alone, bin by bin, where two of them saw the seam; but for pairs whose places are wrong."""
     seen = [_bins_seen(view) for view in views]
@@ -298,18 +310,19 @@ def _stepped_alike(
         if len(seen[i] & seen[j]) >= LEAST_BINS and (i, j) not in not_these
     ]
     alone: dict[int, dict[int, tuple[float, float]]] = {}
+    edges: dict[int, EdgeProfile] = {}
     for k in sorted({k for pair in pairs for k in pair}):
         try:
-            step = measure_step([views[k].shot], angle_sigma_rad=_turning_rad(hand_eye))
+            readings, steps, standards = step.alone(views[k].shot, _turning_rad(hand_eye))
         except GeometryError:
             continue
-        bins = np.rint(step.column("angle_deg") / views[k].shot.seam.course.bin_width).astype(int).tolist()
-        told = zip(step.column("step_mm").tolist(), step.column("standard_mm").tolist(), strict=True)
-        alone[k] = dict(zip(bins, told, strict=True))
+        bins = np.rint(readings / views[k].shot.seam.course.bin_width).astype(int).tolist()
+        told = zip(steps.tolist(), standards.tolist(), strict=True)
+        alone[k], edges[k] = dict(zip(bins, told, strict=True)), edge_profile([views[k]])
     found = []
     for i, j in pairs:
         if i in alone and j in alone:
-            bounds, course = _of_edges(views[i], views[j]), views[i].shot.seam.course
+            bounds, course = _apart(edges[i], edges[j]), views[i].shot.seam.course
             found += list(_unlike(views[i].name, views[j].name, course, alone[i], alone[j], *bounds, thickness_mm))
     return sorted(found, key=lambda finding: finding.severity is not Severity.BAR)[:MOST_SAID]
 
@@ -319,10 +332,9 @@ def _bins_seen(view: PartView) -> set[int]:
     return set(view.shot.seam.course.bins_of(view.shot.angle_rad[walls][::50].astype(np.float64)).tolist())
 
 
-def _of_edges(one: PartView, other: PartView) -> tuple[Floats, Floats]:
+def _apart(one: EdgeProfile, other: EdgeProfile) -> tuple[Floats, Floats]:
     """How far two shots' readings of the surfaces beside the weld are apart, by bin, and their joint U; NaN: unread."""
-    edges = [edge_profile([view]) for view in (one, other)]
-    return np.abs(edges[0].step_mm - edges[1].step_mm), np.hypot(edges[0].u_mm, edges[1].u_mm)
+    return np.abs(one.step_mm - other.step_mm), np.hypot(one.u_mm, other.u_mm)
 
 
 def _unlike(

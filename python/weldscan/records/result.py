@@ -216,10 +216,11 @@ def _judgement(judgement: Judgement) -> dict[str, Any]:
 
 
 def counts(cloud: PartCloud | None) -> dict[str, int]:
-    """How many points there are, in all and per class."""
+    """How many points were measured, in all and per class."""
     label = np.zeros(0, np.uint8) if cloud is None else cloud.label
-    per_label = np.bincount(label, minlength=len(Label))
-    return {"points": int(label.size)} | {name: int(per_label[value]) for name, value in CLASSES.items()}
+    told = cloud is not None and cloud.counts
+    per_label = told if told else np.bincount(label, minlength=len(Label)).tolist()
+    return {"points": sum(per_label)} | {name: per_label[value] for name, value in CLASSES.items()}
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------

@@ -120,7 +120,8 @@ def _finite(cloud: PartCloud | None) -> PartCloud | None:
     if cloud is None or math.isfinite(float(cloud.points_mm.sum()) + float(cloud.deviation_mm.sum())):
         return cloud
     good = np.isfinite(cloud.points_mm).all(axis=1) & np.isfinite(cloud.deviation_mm)
-    return PartCloud(**{field.name: getattr(cloud, field.name)[good] for field in fields(PartCloud)})
+    arrays = [field.name for field in fields(PartCloud) if field.name != "counts"]
+    return replace(cloud, counts=(), **{name: getattr(cloud, name)[good] for name in arrays})
 
 
 # --- the files --------------------------------------------------------------------------------------------------------

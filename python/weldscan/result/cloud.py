@@ -1,4 +1,4 @@
-"""Every measured point of the part, and what it belongs to."""
+"""The measured points of the part, and what they belong to."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ class Label(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class PartCloud:
-    """Every measured point of the part, in base (in the scanner's frame where there is no robot)."""
+    """The measured points of the part, in base (in the scanner's frame where there is no robot): all of them, or one of every
+    cell of the unrolled part.
+    """
 
     points_mm: Floats
     """(n, 3)"""
@@ -37,3 +39,5 @@ class PartCloud:
     """Along the axis from the seam's centreline; the reference wall is negative."""
     shot: NDArray[np.uint16]
     """Index of the part shot."""
+    counts: tuple[int, ...] = ()
+    """Of all points, whether they are here or not, how many have each `Label`; empty: those that are here."""

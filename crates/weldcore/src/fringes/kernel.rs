@@ -2,6 +2,7 @@
 //!
 //! As in [`super::wave`] each loop is compiled for several instruction sets, and all of them give the same bits.
 
+use crate::ground::branchless::{round, turns, turns_of, turns_quotient};
 use std::f64::consts::TAU;
 use std::mem::MaybeUninit;
 
@@ -12,10 +13,7 @@ use super::phase_error::{PhaseError, compensate};
 use super::phase_map::Reason;
 use super::shot::{FringeSet, Shot};
 use super::temporal::Plan;
-use super::wave::{
-    Lane, Level, PixelFit, Sinusoid, TILE, Take, Wave, demodulate, each_pixel, round, tile_of, turns, turns_of,
-    turns_quotient,
-};
+use super::wave::{Lane, Level, PixelFit, Sinusoid, TILE, Take, Wave, demodulate, each_pixel, tile_of};
 
 /// The share of the modulation that harmonics may reach before a pixel has "no fit": a fifth more than a display of
 /// gamma 2.2 left uncorrected makes, (gamma - 1)/(gamma + 2) = 0.286. A single bad frame that passes for a harmonic

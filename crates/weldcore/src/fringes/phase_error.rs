@@ -4,11 +4,12 @@
 //! `φ' = φ + Σ a_m sin(m N φ)`. What is applied is the same error as a series in the measured phase,
 //! `φ = φ' - Σ c_m sin(m N φ')`: it needs more terms than the series in the true phase, but no solving in every pixel.
 
+use crate::ground::branchless::round;
 use std::f64::consts::TAU;
 
 use multiversion::multiversion;
 
-use super::wave::{Lane, round};
+use super::wave::Lane;
 use crate::error::{Error, Result};
 
 /// Terms in the measured phase: with three steps and a gamma of 2.2 the sixteenth is 0.1 mrad.

@@ -19,8 +19,9 @@ use super::phase_error::{
     ErrorSource, NEGLIGIBLE, PhaseError, TERMS, check_steps, in_the_measured_phase, sin_cos_turns, sine_series,
 };
 use super::shot::{FringeSet, Shot, starts};
-use super::wave::{Level, Sinusoid, TILE, Wave, demodulate, round, turns};
+use super::wave::{Level, Sinusoid, TILE, Wave, demodulate};
 use crate::error::{Error, Result, require_positive};
+use crate::ground::branchless::{round, turns};
 use crate::ground::robust::{MEDIAN_TO_SIGMA, TUKEY_SIGMAS, nth};
 use crate::ground::stop::polled;
 use crate::ground::threads;

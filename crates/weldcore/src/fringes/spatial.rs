@@ -11,8 +11,8 @@ use std::f64::consts::TAU;
 
 use rayon::prelude::*;
 
-use super::wave::{round, round64};
 use crate::error::{Error, Result};
+use crate::ground::branchless::{round, round64};
 use crate::ground::memory::require;
 use crate::ground::stop::{poll, polled};
 use crate::ground::threads::{self, CHUNK};

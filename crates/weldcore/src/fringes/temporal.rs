@@ -12,8 +12,8 @@ use std::f64::consts::TAU;
 
 use rayon::prelude::*;
 
-use super::wave::round64;
 use crate::error::{Error, Result};
+use crate::ground::branchless::round64;
 use crate::ground::memory::require;
 use crate::ground::stop::polled;
 use crate::ground::threads::{self, CHUNK};

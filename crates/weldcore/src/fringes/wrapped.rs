@@ -3,8 +3,9 @@
 use multiversion::multiversion;
 use rayon::prelude::*;
 
-use super::wave::{TILE, Wave, atan2};
+use super::wave::{TILE, Wave};
 use crate::error::{Error, Result};
+use crate::ground::branchless::atan2;
 use crate::ground::memory::require;
 use crate::ground::stop::polled;
 use crate::ground::threads::{self, CHUNK};

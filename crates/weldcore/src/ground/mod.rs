@@ -1,6 +1,8 @@
-//! What every room stands on: threads, memory, ending a call, random numbers, robust statistics, images, transforms.
+//! What every room stands on: threads, memory, ending a call, random numbers, robust statistics, images, transforms,
+//! arithmetic for vector instructions.
 
 pub mod allocator;
+pub(crate) mod branchless;
 pub mod image;
 pub mod memory;
 pub mod random;

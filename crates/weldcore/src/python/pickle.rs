@@ -38,7 +38,7 @@ use crate::surfaces::find_spheres::FoundSphere;
 use crate::surfaces::{Cylinder, Plane, Sphere};
 use crate::weld::sections::{Doubt, Edge, Grid, Kind, Sections, Station, WallRun};
 use crate::weld::segment::Segmentation;
-use crate::weld::step::{FoundUnevenness, LargestStep, ProfileBin, Step, StepWave};
+use crate::weld::step::{FoundUnevenness, LargestStep, OwnSurface, ProfileBin, Step, StepWave, Stretched};
 use crate::weld::{Course, Seam, Unrolled};
 
 const VERSION: &str = env!("CARGO_PKG_VERSION");
@@ -196,7 +196,7 @@ structs! {
         middle, course, start_along, station_mm, stations, start_across, bin_mm, bins, heights, noise_mm,
         cell_sigma_mm,
     }
-    WallRun { from, to, height, slope, shrinkage, rms, slope_u, centre, shell_mm }
+    WallRun { from, to, height, slope, shrinkage, rms, slope_u, centre }
     Edge { step_mm, standard_mm, hull_mm, foot_mm }
     Station {
         at, seen, kind, by_course, toes_mm, toes_standard_mm, height_mm, edge, local_step_mm, undisturbed_mm, departure_mm,
@@ -210,11 +210,13 @@ structs! {
     ProfileBin { along, step_mm, standard_mm, fit_mm, unevenness_mm, place_mm, band_mm, departure }
     LargestStep { at, quantiles, interval_mm, band_factor }
     StepWave { n, amplitude_mm, standard_mm, prior_mm }
+    Stretched { course, middle, half }
+    OwnSurface { stretch, table }
     FoundUnevenness { sd_mm, reach_mm, noise }
     Step {
         mean_mm, median_mm, seam_mean_mm, largest, profile, covariance_mm2, departure_limit, coverage, curvature_mm,
         offset_mm, offset_standard_mm, tilt_rad, tilt_standard_rad, waves, shrinkage_mm, unevenness, residual_rms_mm,
-        cells, deviation_mm,
+        cells, surfaces,
     }
     Sample { depth_mm, column_px, row_px, deviation_mm, along, direct, ambient, label }
     Photometry { lamp, distance_mm, ambient, black, gamma, blur_px, full_well_e, read_noise_e, bits, seed }

@@ -8,7 +8,8 @@ use crate::error::Error;
 use crate::python::call::{compute, raise};
 use crate::python::convert::{Whole, float_matrix, parts, transform};
 use crate::python::weld::WeldShot;
-use crate::weld::step::{self, Known, LabelledShot, Modes, ProfileBin, Step, StepWave};
+use crate::weld::place::{self, Scan};
+use crate::weld::step::{self, Known, LabelledShot, Modes, OwnSurface, ProfileBin, Step, StepWave};
 
 /// A column of the profile: its name, and what it holds of a bin.
 type Column = (&'static str, fn(&ProfileBin) -> f64);
@@ -25,7 +26,7 @@ const COLUMNS: [Column; 8] = [
 ];
 
 /// The fields, which `step["mean_mm"]` gives as `step.mean_mm` does.
-const FIELDS: [&str; 24] = [
+const FIELDS: [&str; 23] = [
     "mean_mm",
     "median_mm",
     "seam_mean_mm",
@@ -49,11 +50,13 @@ const FIELDS: [&str; 24] = [
     "profile",
     "profile_columns",
     "covariance_mm2",
-    "deviation_mm",
 ];
 
 /// How large the largest step of some bins is: its median, the larger half of its 95 % interval, its quantiles 0, 1, ... 100 %, c.
 type LargestOf<'py> = (f64, f64, Bound<'py, PyArray1<f64>>, f64);
+
+/// Readings, steps and standard uncertainties.
+type Alone<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>);
 
 /// The step of the other wall over the reference wall (see `measure_step`).
 ///
@@ -61,6 +64,28 @@ type LargestOf<'py> = (f64, f64, Bound<'py, PyArray1<f64>>, f64);
 /// `step.column("step_mm")`.
 #[pyclass(frozen, module = "weldscan")]
 pub(crate) struct WeldStep(pub(crate) Step);
+
+impl WeldStep {
+    /// The reference wall's surface in the shot at place `k`.
+    pub(crate) fn surface(&self, py: Python<'_>, k: usize) -> PyResult<&OwnSurface> {
+        self.0.surfaces.get(k).ok_or_else(|| {
+            let expected = format!("the place of one of the step's {} shots", self.0.surfaces.len());
+            raise(py, &Error::OutOfRange { what: "shot", expected, value: k.to_string() })
+        })
+    }
+}
+
+/// A shot without a place, and without modes.
+fn labelled(shot: &WeldShot) -> LabelledShot<'_> {
+    LabelledShot {
+        modes: None,
+        unrolled: &shot.0.unrolled,
+        labels: &shot.0.labels,
+        seam: shot.0.seam,
+        thickness_mm: shot.0.thickness_mm,
+        base_from_scanner: None,
+    }
+}
 
 #[pymethods]
 impl WeldStep {
@@ -222,10 +247,20 @@ impl WeldStep {
         };
         Ok(self.0.profile.iter().map(of).collect::<Vec<f64>>().into_pyarray(py))
     }
-    /// Per shot (H * W,) float32, mm: how far every point stands off the corrected reference wall.
-    #[getter]
-    fn deviation_mm<'py>(&self, py: Python<'py>) -> Vec<Bound<'py, PyArray1<f32>>> {
-        self.0.deviation_mm.iter().map(|d| PyArray1::from_slice(py, d)).collect()
+    /// How far every point of a shot stands off the reference wall, (H * W,) float32, mm: `shot` is the one at place `k` of those
+    /// that the step was measured on. Raises InputError where there is none.
+    fn deviation_of<'py>(&self, py: Python<'py>, shot: &WeldShot, k: Whole) -> PyResult<Bound<'py, PyArray1<f32>>> {
+        let surface = self.surface(py, k.0)?;
+        Ok(compute(py, || Ok(surface.deviations(&shot.0.unrolled)))?.into_pyarray(py))
+    }
+    /// The step as one shot tells it by itself, in its own frame: readings (n,), step and standard uncertainty (k = 1, mm), bin by
+    /// bin. What its walls' unevenness is like comes from all shots. Raises GeometryError where its walls do not determine it.
+    #[pyo3(signature = (shot, angle_sigma_rad=0.0))]
+    fn alone<'py>(&self, py: Python<'py>, shot: &WeldShot, angle_sigma_rad: f64) -> PyResult<Alone<'py>> {
+        let known = Known { at: angle_sigma_rad };
+        let found = compute(py, || step::alone(&labelled(shot), &known, &self.0.unevenness))?;
+        let column = |k: usize| found.iter().map(|b| b[k]).collect::<Vec<f64>>().into_pyarray(py);
+        Ok((column(0), column(1), column(2)))
     }
     /// Names of the fields, so that `dict(step)` holds them all.
     fn keys(&self) -> [&'static str; FIELDS.len()] {
@@ -303,18 +338,73 @@ fn measure_step(
         .enumerate()
         .map(|(k, (s, base_from_scanner))| LabelledShot {
             modes: modes.get(k).map(|(points, rows, count)| Modes { points, deviation_mm: rows, count: *count }),
-            unrolled: &s.0.unrolled,
-            labels: &s.0.labels,
-            seam: s.0.seam,
-            thickness_mm: s.0.thickness_mm,
             base_from_scanner,
+            ..labelled(s)
         })
         .collect();
     let known = Known { at: angle_sigma_rad };
     compute(py, || step::measure(&views, &known)).map(WeldStep)
 }
 
+/// The arrays of `place_shots`: points, labels, deviation, angle, axial, shot; and how many points have each label.
+type PlacedArrays<'py> = (
+    Bound<'py, PyArray2<f64>>,
+    Bound<'py, PyArray1<u8>>,
+    Bound<'py, PyArray1<f32>>,
+    Bound<'py, PyArray1<f32>>,
+    Bound<'py, PyArray1<f32>>,
+    Bound<'py, PyArray1<u16>>,
+    Vec<usize>,
+);
+
+/// Joins the shots that a step was measured on into one cloud in base.
+///
+/// step: a WeldStep. shots: list of (WeldShot, base_from_scanner (4, 4) float64, number), in the order in which the step has them.
+/// cell_mm: keeps one point of every cell of this size of the unrolled part, that of the first shot that saw it; None: all. Returns
+/// arrays over the points, in order of the shots and pixels: points_mm (n, 3) float64 in base, label uint8, deviation_mm float32 from
+/// the reference wall, angle_deg float32 in [0, 360), axial_mm float32, shot uint16; and of all points, kept or not, how many have
+/// each label. Raises InputError for more shots than the step has, and for a size that is none. Source:
+/// `crates/weldcore/src/weld/place.rs`.
+#[pyfunction]
+#[pyo3(signature = (step, shots, cell_mm=None))]
+fn place_shots<'py>(
+    py: Python<'py>,
+    step: &WeldStep,
+    shots: &Bound<'py, PyAny>,
+    cell_mm: Option<f64>,
+) -> PyResult<PlacedArrays<'py>> {
+    let expected = "a list of (WeldShot, base_from_scanner, number)";
+    let shots: Vec<(PyRef<'py, WeldShot>, Bound<'py, PyAny>, Whole)> = parts("shots", expected, shots)?;
+    let mut scans = Vec::with_capacity(shots.len());
+    for (k, (shot, base_from_scanner, number)) in shots.iter().enumerate() {
+        const NAME: &str = "base_from_scanner";
+        scans.push(Scan {
+            base_from_scanner: transform(NAME, &float_matrix(NAME, base_from_scanner)?)?,
+            unrolled: &shot.0.unrolled,
+            seam: shot.0.seam,
+            labels: &shot.0.labels,
+            surface: step.surface(py, k)?,
+            shot: u16::try_from(number.0).map_err(|_| {
+                let expected = "0 to 65535".into();
+                raise(py, &Error::OutOfRange { what: "number of a shot", expected, value: number.0.to_string() })
+            })?,
+        });
+    }
+    let placed = compute(py, || place::place(&scans, cell_mm))?;
+    let points = placed.points.into_pyarray(py).reshape([placed.labels.len(), 3])?;
+    Ok((
+        points,
+        placed.labels.into_pyarray(py),
+        placed.deviation_mm.into_pyarray(py),
+        placed.along.into_pyarray(py),
+        placed.across_mm.into_pyarray(py),
+        placed.shot.into_pyarray(py),
+        placed.counts.to_vec(),
+    ))
+}
+
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<WeldStep>()?;
+    m.add_function(wrap_pyfunction!(place_shots, m)?)?;
     m.add_function(wrap_pyfunction!(measure_step, m)?)
 }

@@ -17,7 +17,6 @@ use crate::python::call::{compute, raise};
 use crate::python::convert::vector;
 use crate::python::convert::{Whole, floats, parts};
 use crate::python::seam::PySeam;
-use crate::weld::place::{self, Scan};
 use crate::weld::sections::Station;
 use crate::weld::segment::{self, Segmentation};
 use crate::weld::{Course, Nominal};
@@ -87,6 +86,26 @@ impl WeldShot {
     #[getter]
     fn deviation_mm<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
         PyArray1::from_slice(py, &self.0.unrolled.height_mm)
+    }
+    /// Some of the points again, (n, 3) float64, mm, in the scanner's frame, by their place in the shot, (n,) int64; to a ten-thousandth
+    /// of a millimetre, for the shot keeps them in single precision. NaN where there is none. Raises InputError for a place beyond
+    /// the last.
+    fn points_mm<'py>(&self, py: Python<'py>, indices: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let (u, seam) = (&self.0.unrolled, &self.0.seam);
+        let indices: Vec<usize> =
+            parts::<Vec<Whole>>("indices", "whole numbers", indices)?.iter().map(|w| w.0).collect();
+        let mut flat = Vec::with_capacity(3 * indices.len());
+        for i in indices {
+            let Some((at, (across, height))) = u.at.get(i).zip(u.across_mm.get(i).zip(u.height_mm.get(i))) else {
+                let expected = format!("below {}", u.at.len());
+                return Err(raise(py, &Error::OutOfRange { what: "index of a point", expected, value: i.to_string() }));
+            };
+            let at = f64::from(*at);
+            let p = seam.point(at, f64::from(*across)) + seam.outward(at) * f64::from(*height);
+            flat.extend_from_slice(p.as_slice());
+        }
+        let n = flat.len() / 3;
+        flat.into_pyarray(py).reshape([n, 3])
     }
     /// (H * W,) uint8: what became of each point: 0 none, 1 wall, 2 transition, 3 cap, 4 gated, 5 off line, 6 other.
     #[getter]
@@ -224,59 +243,6 @@ fn flat<'a>(py: Python<'_>, array: &'a PyReadonlyArrayDyn<'_, f64>) -> PyResult<
     Ok(array.as_slice().map_err(|_| wrong("strided".into()))?.as_chunks::<3>().0)
 }
 
-/// The arrays of `place_shots`: points, labels, deviation, angle, axial, shot.
-type PlacedArrays<'py> = (
-    Bound<'py, PyArray2<f64>>,
-    Bound<'py, PyArray1<u8>>,
-    Bound<'py, PyArray1<f32>>,
-    Bound<'py, PyArray1<f32>>,
-    Bound<'py, PyArray1<f32>>,
-    Bound<'py, PyArray1<u16>>,
-);
-
-/// Joins segmented shots into one cloud in base.
-///
-/// shots: list of (WeldShot, points_mm (H, W, 3) float64 in the scanner's frame, base_from_scanner (4, 4) float64,
-/// deviation_mm (H * W,) float32, number). Points whose deviation is NaN are left out. Returns arrays over the points that
-/// remain, in order of the shots and pixels: points_mm (n, 3) float64 in base, label uint8, deviation_mm float32,
-/// angle_deg float32 in [0, 360), axial_mm float32, shot uint16. Raises InputError for arrays that do not belong together.
-/// Source: `crates/weldcore/src/place.rs`.
-#[pyfunction]
-fn place_shots<'py>(py: Python<'py>, shots: &Bound<'py, PyAny>) -> PyResult<PlacedArrays<'py>> {
-    let expected = "a list of (WeldShot, points_mm, base_from_scanner, deviation_mm, number)";
-    let shots: Vec<PlacedShot<'py>> = parts("shots", expected, shots)?;
-    let mut scans = Vec::with_capacity(shots.len());
-    for (shot, points, base_from_scanner, deviation, number) in &shots {
-        let wrong =
-            |_| raise(py, &Error::Shape { what: "deviation_mm", expected: "contiguous".into(), got: "strided".into() });
-        scans.push(Scan {
-            points: flat(py, points)?,
-            base_from_scanner: crate::python::convert::transform("base_from_scanner", base_from_scanner)?,
-            unrolled: &shot.0.unrolled,
-            course: shot.0.seam.course,
-            labels: &shot.0.labels,
-            deviation_mm: deviation.as_slice().map_err(wrong)?,
-            shot: u16::try_from(number.0).map_err(|_| {
-                let expected = "0 to 65535".into();
-                raise(py, &Error::OutOfRange { what: "number of a shot", expected, value: number.0.to_string() })
-            })?,
-        });
-    }
-    let placed = compute(py, || place::place(&scans))?;
-    let points = placed.points.into_pyarray(py).reshape([placed.labels.len(), 3])?;
-    Ok((
-        points,
-        placed.labels.into_pyarray(py),
-        placed.deviation_mm.into_pyarray(py),
-        placed.along.into_pyarray(py),
-        placed.across_mm.into_pyarray(py),
-        placed.shot.into_pyarray(py),
-    ))
-}
-
-type PlacedShot<'py> =
-    (PyRef<'py, WeldShot>, PyReadonlyArrayDyn<'py, f64>, PyReadonlyArray2<'py, f64>, PyReadonlyArray1<'py, f32>, Whole);
-
 /// The tables of `seam_fates`.
 type Tables<'py> = (Bound<'py, PyArray2<u32>>, Bound<'py, PyArray2<u32>>, Bound<'py, PyArray3<u32>>);
 
@@ -327,6 +293,5 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<WeldShot>()?;
     m.add_function(wrap_pyfunction!(wall_seen, m)?)?;
     m.add_function(wrap_pyfunction!(segment_weld, m)?)?;
-    m.add_function(wrap_pyfunction!(label_weld, m)?)?;
-    m.add_function(wrap_pyfunction!(place_shots, m)?)
+    m.add_function(wrap_pyfunction!(label_weld, m)?)
 }

@@ -11,8 +11,10 @@ use crate::ground::stop::polled;
 use crate::ground::threads;
 use crate::ground::transform::Vec3;
 
-/// Normals that the coarse frame is found from.
+/// Pixels whose normals are looked for: where half of them hold nothing, one in thirty has its four neighbours.
 const COARSE_POINTS: f64 = 20_000.0;
+/// Normals that the coarse frame is found from: more would change nothing.
+const COARSE_NORMALS: usize = 6_000;
 
 /// Neighbours that a normal of a bare point is of.
 const CLOUD_NEIGHBOURS: usize = 16;
@@ -75,6 +77,7 @@ fn of_cloud(points: &[[f64; 3]]) -> Result<Vec<(Vec3, Vec3)>> {
 /// vote of `p - R n`, both then refined with the points that agree. Degrees and millimetres suffice.
 pub(super) fn coarse_frame(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<Seam> {
     let seen = if width == 1 || width == points.len() { of_cloud(points)? } else { of_grid(points, width) };
+    let seen: Vec<(Vec3, Vec3)> = seen.iter().step_by((seen.len() / COARSE_NORMALS).max(1)).copied().collect();
     require_count("part points with a normal", 100, seen.len())?;
     let axis = axis_from_normals(&seen, nominal)?;
     let middle = seen.iter().map(|(p, _)| p).sum::<Vec3>() / seen.len() as f64;
@@ -166,15 +169,21 @@ fn vote_centre(seen: &[(Vec3, Vec3)], frame: &Seam) -> Vec3 {
 /// Moves the axis sideways to the least squares of the radial deviations, reweighted; in place.
 fn refine_centre(seen: &[(Vec3, Vec3)], frame: &mut Seam) {
     let square = frame.square();
+    let radius = frame.course.radius_mm();
     for _ in 0..10 {
-        let deviation = |p: &Vec3| frame.place(&(*p).into());
-        let mut sizes: Vec<f64> = seen.iter().map(|(p, _)| deviation(p)[2].abs()).collect();
+        // Direction from the axis, and distance from the surface.
+        let placed = |(p, _): &(Vec3, Vec3)| {
+            let v = p - frame.origin_mm;
+            let (x, y) = (v.dot(&frame.zero), v.dot(&square));
+            let r = (x * x + y * y).sqrt();
+            [x / r, y / r, r - radius]
+        };
+        let places: Vec<[f64; 3]> = seen.iter().map(placed).filter(|p| p[0].is_finite()).collect();
+        let mut sizes: Vec<f64> = places.iter().map(|p| p[2].abs()).collect();
         let scale = TUKEY_SIGMAS * MEDIAN_TO_SIGMA * median(&mut sizes).max(1e-6);
         let (mut xx, mut xy, mut yy, mut bx, mut by) = (0.0, 0.0, 0.0, 0.0, 0.0);
-        for (p, _) in seen {
-            let [angle, _, d] = deviation(p);
+        for [c, s, d] in places {
             let w = tukey(d / scale);
-            let (s, c) = angle.sin_cos();
             xx += w * c * c;
             xy += w * c * s;
             yy += w * s * s;
@@ -187,7 +196,7 @@ fn refine_centre(seen: &[(Vec3, Vec3)], frame: &mut Seam) {
         }
         let (dx, dy) = ((yy * bx - xy * by) / det, (xx * by - xy * bx) / det);
         frame.origin_mm += frame.zero * dx + square * dy;
-        if dx.hypot(dy) < 1e-6 * frame.course.radius_mm() {
+        if dx.hypot(dy) < 1e-6 * radius {
             return;
         }
     }

@@ -5,12 +5,16 @@
 //! into bins, and into the number that people read. Where [`Course`] is asked, another kind of seam answers for itself; a straight
 //! one, whose parameter is mm and whose radius is infinite, is one more variant here.
 
-use std::f64::consts::TAU;
+use std::f64::consts::{PI, TAU};
 
+use multiversion::multiversion;
 use nalgebra::Matrix3;
+use rayon::prelude::*;
 
 use crate::error::{Error, Result, require_count, require_positive};
-use crate::ground::threads;
+use crate::ground::branchless::atan2;
+use crate::ground::stop::polled;
+use crate::ground::threads::{self, CHUNK};
 use crate::ground::transform::Vec3;
 use crate::surfaces::{PointNoise, cylinder};
 
@@ -30,7 +34,7 @@ const DIAMETER_TOLERANCE: f64 = 0.01;
 /// A radius this far from the nominal one, relative, is another pipe's: ovality bends a pipe locally by a few per cent.
 const OTHER_PIPE: f64 = 0.2;
 /// Points that the surface of the reference wall is fitted to.
-const FIT_POINTS: usize = 40_000;
+const FIT_POINTS: usize = 10_000;
 
 /// How a seam runs.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -81,7 +85,8 @@ impl Course {
     #[inline]
     pub fn apart(self, to: f64, from: f64) -> f64 {
         let turn = to - from;
-        turn - (turn / TAU).round() * TAU
+        // Mostly it is the short way already, and rounding is a call.
+        if turn.abs() < PI { turn } else { turn - (turn / TAU).round() * TAU }
     }
 
     /// The middle of places, of whatever precision.
@@ -277,6 +282,11 @@ impl Seam {
         (a > 0.0 && root >= 0.0).then(|| (b - root.sqrt()) / a).filter(|t| *t > 0.0).map(|t| ray * t)
     }
 
+    /// Of so many points of the reference wall every how-manieth its surface is fitted to.
+    pub(super) fn fit_stride(count: usize) -> usize {
+        count.div_ceil(FIT_POINTS).max(1)
+    }
+
     /// The seam whose surface fits the reference wall's points best by orthogonal distance, begun at this one, with what they
     /// allow: a free radius where it is determined to better than a pipe's delivery tolerance, else the nominal one; where
     /// they are too flat even for that, as a plane is laid on them. And whether the radius was free.
@@ -285,7 +295,7 @@ impl Seam {
     /// [`Error::TooFew`] without points; [`Error::Degenerate`] where they are another part's.
     pub(super) fn refined(&self, wall: &[[f64; 3]], nominal: Course) -> Result<(Self, bool)> {
         require_count("points of the reference wall", 100, wall.len())?;
-        let sample: Vec<[f64; 3]> = wall.iter().step_by(wall.len().div_ceil(FIT_POINTS)).copied().collect();
+        let sample: Vec<[f64; 3]> = wall.iter().step_by(Self::fit_stride(wall.len())).copied().collect();
         let told = nominal.radius_mm();
         let start =
             cylinder::Cylinder { point_mm: self.origin_mm, axis: self.across, radius_mm: self.course.radius_mm() };
@@ -354,24 +364,32 @@ pub struct Unrolled {
 impl Unrolled {
     /// Places every point.
     pub fn of(points: &[[f64; 3]], seam: &Seam) -> Self {
-        let (square, radius) = (seam.square(), seam.course.radius_mm());
-        let parts = threads::map_chunks(points, |_, chunk| {
-            let mut part = Self::default();
-            for p in chunk {
-                let v = Vec3::from(*p) - seam.origin_mm;
-                let (x, y) = (v.dot(&seam.zero), v.dot(&square));
-                part.at.push((y as f32).atan2(x as f32));
-                part.across_mm.push(v.dot(&seam.across) as f32);
-                part.height_mm.push(((x * x + y * y).sqrt() - radius) as f32);
-            }
-            part
+        let n = points.len();
+        let mut all = Self { at: vec![0.0; n], across_mm: vec![0.0; n], height_mm: vec![0.0; n] };
+        threads::install(|| {
+            let (at, across) = (all.at.par_chunks_mut(CHUNK), all.across_mm.par_chunks_mut(CHUNK));
+            let slots = at.zip(across).zip(all.height_mm.par_chunks_mut(CHUNK));
+            points.par_chunks(CHUNK).inspect(polled).zip(slots).for_each(|(points, ((at, across), height))| {
+                unroll(points, seam, at, across, height);
+            });
         });
-        let gather = |pick: fn(&Self) -> &Vec<f32>| {
-            let mut all = Vec::with_capacity(points.len());
-            parts.iter().for_each(|p| all.extend_from_slice(pick(p)));
-            all
-        };
-        Self { at: gather(|p| &p.at), across_mm: gather(|p| &p.across_mm), height_mm: gather(|p| &p.height_mm) }
+        all
+    }
+}
+
+/// [`Seam::place`] of many points.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2"))]
+fn unroll(points: &[[f64; 3]], seam: &Seam, at: &mut [f32], across_mm: &mut [f32], height_mm: &mut [f32]) {
+    let [ox, oy, oz]: [f64; 3] = seam.origin_mm.into();
+    let [[zx, zy, zz], [sx, sy, sz], [ax, ay, az]]: [[f64; 3]; 3] =
+        [seam.zero.into(), seam.square().into(), seam.across.into()];
+    let radius = seam.course.radius_mm();
+    for (((p, at), across), height) in points.iter().zip(at).zip(across_mm).zip(height_mm) {
+        let (vx, vy, vz) = (p[0] - ox, p[1] - oy, p[2] - oz);
+        let (x, y) = (vx * zx + vy * zy + vz * zz, vx * sx + vy * sy + vz * sz);
+        *at = atan2(y, x) as f32;
+        *across = (vx * ax + vy * ay + vz * az) as f32;
+        *height = ((x * x + y * y).sqrt() - radius) as f32;
     }
 }
 

@@ -3,14 +3,17 @@
 //! The shot is unrolled into the seam's frame: along, across, height. [`crate::weld::sections`] finds cap, toes and undisturbed
 //! walls in it, station by station; every point gets a fate by them. The reference wall's surface is then fitted to its undisturbed points, with the weld's shrinkage taken out, and all is counted from it.
 
+use rayon::prelude::*;
+
 use super::coarse::{Nominal, coarse_frame};
 use super::label::{Fate, Label};
 use super::seam::{Seam, Unrolled};
 use crate::error::{Error, Result, require_positive};
 use crate::ground::robust::median;
-use crate::ground::threads;
+use crate::ground::stop::polled;
+use crate::ground::threads::{self, CHUNK};
 use crate::ground::transform::Vec3;
-use crate::weld::sections::{self, Sections, Station, TOLERANCE_MM, shell_term};
+use crate::weld::sections::{self, Sections, ShellTable, Station, TOLERANCE_MM};
 
 /// A segmented shot.
 #[derive(Debug, Clone)]
@@ -116,14 +119,11 @@ pub fn labelled(points: &[[f64; 3]], labels: &[u8], near: &Seam, thickness_mm: f
 /// What became of every point, from the sections: its [`Fate`] and its [`Label`].
 fn sort_points(sections: &Sections, unrolled: &Unrolled, thickness_mm: f64) -> (Vec<u8>, Vec<u8>) {
     let grid = &sections.grid;
+    let shell = ShellTable::new(grid.course.shell_mm(thickness_mm));
     let own: Vec<Option<Bed>> = (0..sections.stations.len()).map(|k| Bed::of(sections, k)).collect();
     // What little a station without a weld of its own holds is held against its neighbour's.
-    let beds: Vec<Option<(usize, Bed)>> = (0..own.len())
-        .map(|k| {
-            let mut near = (0..=4).flat_map(|d: usize| [k.wrapping_sub(d), k + d]);
-            near.find_map(|j| Some((j, (*own.get(j)?)?)))
-        })
-        .collect();
+    let near = |k: usize| (0..=4).flat_map(move |d: usize| [k.wrapping_sub(d), k + d]);
+    let beds: Vec<Option<Bed>> = (0..own.len()).map(|k| near(k).find_map(|j| *own.get(j)?)).collect();
     let tolerance = TOLERANCE_MM.max(5.0 * sections.noise_mm) + 4.0 * sections.noise_mm;
     let gate = GATE_THICKNESSES * thickness_mm;
     let sort = |i: usize| -> (Fate, Label) {
@@ -133,12 +133,13 @@ fn sort_points(sections: &Sections, unrolled: &Unrolled, thickness_mm: f64) -> (
         }
         // Beyond the stations there is nothing of the seam.
         let Some(k) = grid.station_within(p.along, CORNER_STATIONS) else { return (Fate::Other, Label::None) };
-        let Some((k, bed)) = beds[k] else {
+        let Some(bed) = &beds[k] else {
             return (if p.height.abs() > gate { Fate::Gated } else { Fate::Other }, Label::None);
         };
-        let side = usize::from(p.across > 0.5 * (bed.toes[0] + bed.toes[1]));
-        let out = if side == 0 { bed.toes[0] - p.across } else { p.across - bed.toes[1] };
-        let off = sections.stations[k].wall_at(side, p.across).map_or(p.height, |wall| p.height - wall);
+        let side = usize::from(p.across > bed.middle);
+        let (mine, x) = (&bed.sides[side], if side == 0 { -p.across } else { p.across });
+        let out = x - mine.toe;
+        let off = p.height - mine.height - mine.slope * x - mine.shrinkage * shell.at(x - mine.centre);
         if out <= 0.0 {
             let fate = if off.abs() > gate + bed.height { Fate::Gated } else { Fate::Cap };
             return (fate, Label::Bead);
@@ -146,12 +147,11 @@ fn sort_points(sections: &Sections, unrolled: &Unrolled, thickness_mm: f64) -> (
         if off.abs() > gate {
             return (Fate::Gated, Label::None);
         }
-        let Some(begin) = bed.undisturbed[side] else { return (Fate::Other, Label::None) };
-        let end = bed.ends[side];
+        let Some(begin) = mine.undisturbed else { return (Fate::Other, Label::None) };
         let fits = off.abs() <= tolerance;
         let fate = match (out, fits) {
             (_, true) => Fate::Wall,
-            (out, _) if out > end + grid.bin_mm => Fate::Other,
+            (out, _) if out > mine.end + grid.bin_mm => Fate::Other,
             (out, false) if out < begin => Fate::Transition,
             _ => Fate::OffLine,
         };
@@ -163,23 +163,44 @@ fn sort_points(sections: &Sections, unrolled: &Unrolled, thickness_mm: f64) -> (
         };
         (fate, label)
     };
-    let parts = threads::map_ranges(unrolled.at.len(), |range| {
-        range.map(sort).map(|(fate, label)| (fate as u8, label as u8)).unzip::<u8, u8, Vec<u8>, Vec<u8>>()
+    let (mut fates, mut labels) = (vec![0; unrolled.at.len()], vec![0; unrolled.at.len()]);
+    threads::install(|| {
+        let chunks = fates.par_chunks_mut(CHUNK).zip(labels.par_chunks_mut(CHUNK)).inspect(polled);
+        chunks.enumerate().for_each(|(k, (fates, labels))| {
+            for (i, (fate, label)) in fates.iter_mut().zip(labels).enumerate() {
+                let sorted = sort(k * CHUNK + i);
+                (*fate, *label) = (sorted.0 as u8, sorted.1 as u8);
+            }
+        });
     });
-    let (fates, labels): (Vec<Vec<u8>>, Vec<Vec<u8>>) = parts.into_iter().unzip();
-    (fates.concat(), labels.concat())
+    (fates, labels)
 }
 
 /// What the points of one station are held against.
 #[derive(Debug, Clone, Copy)]
 struct Bed {
-    toes: [f64; 2],
+    /// Between the toes.
+    middle: f64,
+    /// Of the cap.
     height: f64,
-    /// From where each wall is undisturbed, mm outward of its toe: the median of five stations, so that one that a wave or a
-    /// drop of spatter stopped loses no wall.
-    undisturbed: [Option<f64>; 2],
-    /// How far out it was looked at.
-    ends: [f64; 2],
+    /// The reference wall's and the other wall's.
+    sides: [BedSide; 2],
+}
+
+/// One side of it; x is counted across the seam, outward.
+#[derive(Debug, Clone, Copy)]
+struct BedSide {
+    toe: f64,
+    /// From where the wall is undisturbed, outward of its toe: the median of five stations, so that one that a wave or a drop of
+    /// spatter stopped loses no wall.
+    undisturbed: Option<f64>,
+    /// How far out of the toe it was looked at.
+    end: f64,
+    /// The wall: height at x = 0, slope, shrinkage about its centre; without a wall all are 0.
+    height: f64,
+    slope: f64,
+    shrinkage: f64,
+    centre: f64,
 }
 
 impl Bed {
@@ -192,15 +213,18 @@ impl Bed {
             let (toes, from) = (s.toes_mm?, s.undisturbed_mm[side]?);
             Some(if side == 0 { toes[0] - from } else { from - toes[1] })
         };
-        let undisturbed = std::array::from_fn(|side| {
-            own.undisturbed_mm[side]?;
-            let mut all: Vec<f64> = near.iter().filter_map(|s| outward(s, side)).collect();
-            Some(median(&mut all))
+        let sides = std::array::from_fn(|side| {
+            let undisturbed = own.undisturbed_mm[side].map(|_| {
+                let mut all: Vec<f64> = near.iter().filter_map(|s| outward(s, side)).collect();
+                median(&mut all)
+            });
+            let toe = if side == 0 { -toes[0] } else { toes[1] };
+            let (end, height, slope, shrinkage, centre) = own.walls[side].map_or_else(Default::default, |run| {
+                (run.to - toe, run.straight(0.0), run.slope, run.shrinkage, run.centre)
+            });
+            BedSide { toe, undisturbed, end, height, slope, shrinkage, centre }
         });
-        let ends = std::array::from_fn(|side| {
-            own.walls[side].map_or(0.0, |run| run.to - if side == 0 { -toes[0] } else { toes[1] })
-        });
-        Some(Self { toes, height: own.height_mm.abs(), undisturbed, ends })
+        Some(Self { middle: 0.5 * (toes[0] + toes[1]), height: own.height_mm.abs(), sides })
     }
 }
 
@@ -230,7 +254,7 @@ fn reframe(sections: &mut Sections, coarse: &Seam, seam: &Seam) {
     }
 }
 
-/// Points of the reference wall with the weld's shrinkage taken out, so that they lie on its surface.
+/// Points of the reference wall with the weld's shrinkage taken out, so that they lie on its surface: as many as its fit takes.
 fn undrawn(
     points: &[[f64; 3]],
     labels: &[u8],
@@ -245,14 +269,16 @@ fn undrawn(
     let mut middles: Vec<f64> =
         sections.stations.iter().filter_map(|s| s.toes_mm.map(|t| 0.5 * (t[0] + t[1]))).collect();
     let middle = if middles.is_empty() { 0.0 } else { median(&mut middles) };
-    let shell_mm = coarse.course.shell_mm(thickness_mm);
-    let wall = (0..points.len()).filter(|&i| labels[i] == Label::ReferenceWall as u8);
-    wall.map(|i| {
-        let z = f64::from(unrolled.across_mm[i]) - middle;
-        let lift = -drawn * shell_term(z, shell_mm);
-        (Vec3::from(points[i]) + coarse.outward(f64::from(unrolled.at[i])) * lift).into()
-    })
-    .collect()
+    let shell = ShellTable::new(coarse.course.shell_mm(thickness_mm));
+    let of_wall = || (0..points.len()).filter(|&i| labels[i] == Label::ReferenceWall as u8);
+    of_wall()
+        .step_by(Seam::fit_stride(of_wall().count()))
+        .map(|i| {
+            let z = f64::from(unrolled.across_mm[i]) - middle;
+            let lift = -drawn * shell.at(z);
+            (Vec3::from(points[i]) + coarse.outward(f64::from(unrolled.at[i])) * lift).into()
+        })
+        .collect()
 }
 
 #[cfg(test)]

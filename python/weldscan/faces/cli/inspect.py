@@ -27,6 +27,13 @@ class Method(StrEnum):
     paper = "paper"
 
 
+class Cloud(StrEnum):
+    """Which points are kept."""
+
+    cells = "cells"
+    all = "all"
+
+
 def register(app: typer.Typer) -> None:
     """Add `inspect` and `demo`."""
     app.command(
@@ -80,6 +87,12 @@ def inspect(
             help="How much of the seam must be seen for a PASS; less is INCONCLUSIVE. Default: what the session says.",
         ),
     ] = None,
+    cloud: Annotated[
+        Cloud,
+        typer.Option(
+            help="What cloud.ply holds. cells: of more than 4 million points one of every cell of 0.15 mm; all: every point."
+        ),
+    ] = Cloud.cells,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print result.json instead of the summary: one document on stdout.")
     ] = False,
@@ -104,6 +117,7 @@ def inspect(
         history=history,
         accept_verification=accept_verification,
         required_coverage_deg=required,
+        cloud=cloud.value,
     )
     with terminal.answer(EXIT_CODES[found.verdict]):
         if as_json:

@@ -1,11 +1,12 @@
 //! How well the frames agree under a reading of them: by the residuals of each set, and by what the sets say of each other.
 
+use crate::ground::branchless::{round64, turns};
 use std::f64::consts::TAU;
 
 use super::super::phase_error::{PhaseError, sine_series};
 use super::super::shot::{FringeSet, starts};
 use super::super::temporal::Plan;
-use super::super::wave::{Wave, round64, turns};
+use super::super::wave::Wave;
 use super::clear_pixels::{ClearPixels, FEWEST};
 
 /// Noise of a decision on the fringe order, in fringes, up to which a pixel speaks of it.

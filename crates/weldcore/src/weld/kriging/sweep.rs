@@ -35,6 +35,9 @@ pub(crate) struct Reduced {
 
 /// Eliminates a wall; `None` where the numbers do not allow it.
 pub(crate) fn sweep(line: &SeamLine, wall: &KrigedWall, scales: &Scales, asked: &[Asked]) -> Option<Reduced> {
+    if wall.rows_mm.is_empty() {
+        return None;
+    }
     let chain = ColumnChain::new(scales.along_mm, line.spacing_mm);
     let basis = Basis::new(&wall.rows_mm, scales.sd_mm, scales.across_mm);
     let (rank, border, over) = (basis.rank(), wall.width.total(), 1.0 / scales.noise);

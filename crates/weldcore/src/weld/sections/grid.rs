@@ -4,7 +4,8 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result, require_count};
 use crate::ground::robust::{MEDIAN_TO_SIGMA, median, median_between};
-use crate::ground::threads;
+use crate::ground::stop::polled;
+use crate::ground::threads::{self, CHUNK};
 use crate::weld::seam::{Course, Unrolled};
 
 /// Bins across the seam, in point spacings, and their least and largest width: a toe is placed to about a bin.
@@ -16,6 +17,8 @@ const POINTS_PER_CELL: f64 = 3.0;
 const LEAST_POINTS: usize = 2;
 /// Cells with so many points tell the noise.
 const NOISE_POINTS: usize = 6;
+/// Of about so many.
+const NOISE_CELLS: usize = 2000;
 /// Of every so many points one tells how far the view reaches.
 const RANGE_STRIDE: usize = 16;
 
@@ -110,13 +113,13 @@ impl Grid {
     #[inline]
     pub fn station_within(&self, along: f64, beyond: f64) -> Option<usize> {
         let k = (along - self.start_along) / self.station_mm;
-        (k > -beyond && k < self.stations as f64 + beyond).then(|| (k.max(0.0) as usize).min(self.stations - 1))
+        (k > -beyond && k < self.stations as f64 + beyond).then(|| (k.max(0.0) as i32 as usize).min(self.stations - 1))
     }
 
     #[inline]
     fn bin(&self, across: f64) -> Option<usize> {
         let k = (across - self.start_across) / self.bin_mm;
-        (k >= 0.0 && k < self.bins as f64).then_some(k as usize)
+        (k >= 0.0 && k < self.bins as f64).then_some(k as i32 as usize)
     }
 
     /// Middle of a station, in the seam's parameter.
@@ -149,23 +152,26 @@ impl Grid {
         let cell_of = |i: usize| {
             let p = self.place(unrolled, i);
             p.height.is_finite().then_some(())?;
-            Some((self.station(p.along)? * self.bins + self.bin(p.across)?, p.height as f32))
+            Some(self.station(p.along)? * self.bins + self.bin(p.across)?)
         };
-        let mut starts = vec![0_usize; cells + 1];
-        let found: Vec<Vec<(u32, f32)>> = threads::map_ranges(unrolled.at.len(), |range| {
-            range.filter_map(|i| cell_of(i).map(|(k, d)| (k as u32, d))).collect()
+        // Points of no cell are those of one more.
+        let mut cell: Vec<u32> = vec![0; unrolled.at.len()];
+        threads::install(|| {
+            cell.par_chunks_mut(CHUNK).inspect(polled).enumerate().for_each(|(k, part)| {
+                part.iter_mut().enumerate().for_each(|(i, slot)| {
+                    *slot = cell_of(k * CHUNK + i).unwrap_or(cells) as u32;
+                });
+            });
         });
-        for (cell, _) in found.iter().flatten() {
-            starts[*cell as usize + 1] += 1;
-        }
-        for k in 0..cells {
-            starts[k + 1] += starts[k];
-        }
-        let mut sorted = vec![0.0_f32; starts[cells]];
+        let mut starts = vec![0_usize; cells + 2];
+        cell.iter().for_each(|cell| starts[*cell as usize + 1] += 1);
+        (0..=cells).for_each(|k| starts[k + 1] += starts[k]);
+        let mut sorted = vec![0.0_f32; cell.len()];
         let mut next = starts.clone();
-        for (cell, d) in found.iter().flatten() {
-            sorted[next[*cell as usize]] = *d;
-            next[*cell as usize] += 1;
+        for (cell, height) in cell.iter().zip(&unrolled.height_mm) {
+            let slot = &mut next[*cell as usize];
+            sorted[*slot] = *height;
+            *slot += 1;
         }
         let mut slices: Vec<&mut [f32]> = Vec::with_capacity(cells);
         let mut rest = sorted.as_mut_slice();
@@ -174,7 +180,12 @@ impl Grid {
             slices.push(head);
             rest = tail;
         }
-        let stats: Vec<(f64, f64, usize)> = threads::install(|| slices.into_par_iter().map(cell_statistics).collect());
+        // So many cells tell the noise as well as all do.
+        let telling = (cells / NOISE_CELLS).max(1);
+        let stats: Vec<(f64, f64, usize)> = threads::install(|| {
+            let each = slices.into_par_iter().enumerate().with_min_len(64);
+            each.map(|(k, values)| cell_statistics(values, k % telling == 0)).collect()
+        });
         let mut noises: Vec<f64> = stats.iter().map(|s| s.1).filter(|s| s.is_finite()).collect();
         let mut counts: Vec<f64> = stats.iter().filter(|s| s.0.is_finite()).map(|s| s.2 as f64).collect();
         self.heights = stats.iter().map(|s| s.0).collect();
@@ -193,14 +204,14 @@ impl Grid {
     }
 }
 
-/// Median, noise of one point (NaN with too few), and count.
-fn cell_statistics(values: &mut [f32]) -> (f64, f64, usize) {
+/// Median, noise of one point (NaN with too few, and where it is not asked for), and count.
+fn cell_statistics(values: &mut [f32], with_noise: bool) -> (f64, f64, usize) {
     let n = values.len();
     if n < LEAST_POINTS {
         return (f64::NAN, f64::NAN, n);
     }
     let m = median_between(values);
-    if n < NOISE_POINTS {
+    if n < NOISE_POINTS || !with_noise {
         return (m, f64::NAN, n);
     }
     values.iter_mut().for_each(|v| *v = (*v - m as f32).abs());

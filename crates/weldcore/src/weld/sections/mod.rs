@@ -31,7 +31,7 @@ pub(crate) use grid::Grid;
 pub use station::{Doubt, Edge, Kind, Station};
 #[cfg(feature = "python")]
 pub(crate) use walls::WallRun;
-pub(crate) use walls::{TOLERANCE_MM, shell_term};
+pub(crate) use walls::{ShellTable, TOLERANCE_MM, shell_term};
 
 use super::seam::{Course, Unrolled};
 use crate::error::{Error, Result};

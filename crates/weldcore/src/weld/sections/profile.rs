@@ -106,12 +106,12 @@ impl Profile {
 
     /// The boundary between bins next to x, in [0, len].
     pub fn boundary(&self, x: f64) -> usize {
-        ((x - self.start) / self.bin).round().clamp(0.0, self.len() as f64) as usize
+        ((x - self.start) / self.bin + 0.5).clamp(0.0, self.len() as f64) as usize
     }
 
     /// A length in whole bins.
     pub fn in_bins(&self, length: f64) -> usize {
-        (length / self.bin).round().max(1.0) as usize
+        (length / self.bin + 0.5).max(1.0) as usize
     }
 
     fn sum(&self, from: usize, to: usize) -> [f64; SUMS] {

@@ -181,13 +181,12 @@ impl View<'_> {
         if !seen {
             return (station, toes);
         }
-        let shell = self.grid.course.shell_mm(self.thickness_mm);
         let centre = 0.5 * (toes[0].at + toes[1].at);
         station.toes_mm = Some([toes[0].at, toes[1].at]);
         for (side, toe) in toes.iter().enumerate() {
             let sign = if side == 0 { -1.0 } else { 1.0 };
             let profile = &self.smooth[k][side];
-            station.walls[side] = walls::grow(profile, sign * toe.at, sign * centre, shell, self.sigma);
+            station.walls[side] = walls::grow(profile, sign * toe.at, sign * centre, &self.shell, self.sigma);
             station.undisturbed_mm[side] = station.walls[side].map(|run| sign * run.from);
         }
         if let (Some(a), Some(b)) = (station.straight_at(0, centre), station.straight_at(1, centre)) {

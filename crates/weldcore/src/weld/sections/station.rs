@@ -71,11 +71,7 @@ pub struct Station {
 }
 
 impl Station {
-    /// The wall of a side (0 reference, 1 other) at a place across the seam, with its shrinkage.
-    pub(crate) fn wall_at(&self, side: usize, x: f64) -> Option<f64> {
-        self.walls[side].map(|run| run.at(if side == 0 { -x } else { x }))
-    }
-
+    /// The straight wall of a side (0 reference, 1 other) at a place across the seam.
     pub(super) fn straight_at(&self, side: usize, x: f64) -> Option<f64> {
         self.walls[side].map(|run| run.straight(if side == 0 { -x } else { x }))
     }

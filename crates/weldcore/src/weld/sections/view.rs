@@ -6,7 +6,7 @@ use super::cap::{self, Candidate, WeldLine, widest_cap_mm};
 use super::grid::Grid;
 use super::profile::Profile;
 use super::station::{Kind, Station};
-use super::walls::TOLERANCE_MM;
+use super::walls::{ShellTable, TOLERANCE_MM};
 use crate::error::{Error, Result};
 use crate::ground::robust::median;
 use crate::ground::threads;
@@ -33,6 +33,7 @@ pub(super) struct View<'a> {
     /// The station alone: for reading.
     pub(super) own: Vec<[Profile; 2]>,
     pub(super) thickness_mm: f64,
+    pub(super) shell: ShellTable,
     pub(super) sigma: f64,
     pub(super) widest_mm: f64,
 }
@@ -59,7 +60,16 @@ impl<'a> View<'a> {
         let (smooth, own) = threads::install(|| {
             rows.par_iter().map(|&k| (both(&smoothed[k * grid.bins..(k + 1) * grid.bins]), both(grid.row(k)))).unzip()
         });
-        Self { grid, smooth, own, thickness_mm, sigma: grid.cell_sigma_mm, widest_mm: widest_cap_mm(thickness_mm) }
+        let shell = ShellTable::new(grid.course.shell_mm(thickness_mm));
+        Self {
+            grid,
+            smooth,
+            own,
+            thickness_mm,
+            shell,
+            sigma: grid.cell_sigma_mm,
+            widest_mm: widest_cap_mm(thickness_mm),
+        }
     }
 
     pub(super) fn along(&self, station: usize) -> f64 {

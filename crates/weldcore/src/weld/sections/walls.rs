@@ -30,6 +30,36 @@ pub(crate) fn shell_term(distance_mm: f64, shell_mm: Option<f64>) -> f64 {
     (-x).exp() * (x.cos() + x.sin())
 }
 
+/// [`shell_term`] of many places: straight between values a tenth of a millimetre apart, which is off by a thousandth at most where
+/// `√(R t)` is 3 mm or more.
+pub(crate) struct ShellTable {
+    values: Vec<f64>,
+}
+
+impl ShellTable {
+    const STEP_MM: f64 = 0.1;
+    /// In `√(R t)`: what is left beyond is less than a thousandth.
+    const REACH: f64 = 6.0;
+
+    pub fn new(shell_mm: Option<f64>) -> Self {
+        let count = (Self::REACH * shell_mm.unwrap_or(0.0) / Self::STEP_MM).ceil() as usize + 2;
+        let term = |k: usize| shell_term(k as f64 * Self::STEP_MM, shell_mm);
+        let mut values: Vec<f64> = (0..count).map(term).collect();
+        values[count - 2..].fill(0.0);
+        Self { values }
+    }
+
+    #[inline]
+    pub fn at(&self, distance_mm: f64) -> f64 {
+        let last = self.values.len() - 2;
+        let place = (distance_mm.abs() * (1.0 / Self::STEP_MM)).min(last as f64);
+        // A shorter way than as usize, which asks for the largest numbers.
+        let k = (place as i32 as usize).min(last);
+        let [a, b] = [self.values[k], self.values[k + 1]];
+        a + (place - k as f64) * (b - a)
+    }
+}
+
 /// An undisturbed wall of one station.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct WallRun {
@@ -45,18 +75,12 @@ pub(crate) struct WallRun {
     /// Standard uncertainty of the slope.
     pub slope_u: f64,
     pub(crate) centre: f64,
-    pub(crate) shell_mm: Option<f64>,
 }
 
 impl WallRun {
     /// The straight wall without its shrinkage.
     pub fn straight(&self, x: f64) -> f64 {
         self.height + self.slope * (x - self.centre)
-    }
-
-    /// The wall with its shrinkage.
-    pub fn at(&self, x: f64) -> f64 {
-        self.straight(x) + self.shrinkage * shell_term(x - self.centre, self.shell_mm)
     }
 }
 
@@ -67,8 +91,8 @@ pub(super) fn tolerance(sigma: f64) -> f64 {
 }
 
 /// Grows the wall to the right of `toe` from the edge of the view; `None` where no stretch of it is one.
-pub(super) fn grow(profile: &Profile, toe: f64, centre: f64, shell_mm: Option<f64>, sigma: f64) -> Option<WallRun> {
-    let side = Side::of(profile, toe, centre, shell_mm);
+pub(super) fn grow(profile: &Profile, toe: f64, centre: f64, shell: &ShellTable, sigma: f64) -> Option<WallRun> {
+    let side = Side::of(profile, toe, centre, shell);
     let end = profile.edge(side.bins.last()?.index + 1);
     let tolerance = tolerance(sigma);
     let first = FIRST_MM.max(FIRST_PART * (end - toe)).min(end - toe);
@@ -105,28 +129,48 @@ struct SideBin {
     shell: f64,
 }
 
-/// All that lies to the right of a toe.
+/// Sums of 1, z, z², shell, z·shell, shell², h, zh, shell·h, h².
+const SUMS: usize = 10;
+
+/// All that lies to the right of a toe, with running sums: a fit of any stretch costs nothing.
 struct Side<'a> {
     profile: &'a Profile,
     bins: Vec<SideBin>,
+    sums: Vec<[f64; SUMS]>,
+    /// z is counted from here in the sums, so that they do not cancel.
+    middle: f64,
     centre: f64,
-    shell_mm: Option<f64>,
 }
 
 impl<'a> Side<'a> {
-    fn of(profile: &'a Profile, toe: f64, centre: f64, shell_mm: Option<f64>) -> Self {
+    fn of(profile: &'a Profile, toe: f64, centre: f64, shell: &ShellTable) -> Self {
         let one = |index: usize| {
             let z = profile.x(index) - centre;
-            SideBin { index, z, height: profile.heights[index], shell: shell_term(z, shell_mm) }
+            SideBin { index, z, height: profile.heights[index], shell: shell.at(z) }
         };
-        let bins = (profile.boundary(toe)..profile.len()).map(one).filter(|b| b.height.is_finite()).collect();
-        Self { profile, bins, centre, shell_mm }
+        let bins: Vec<SideBin> =
+            (profile.boundary(toe)..profile.len()).map(one).filter(|b| b.height.is_finite()).collect();
+        let middle = bins.first().zip(bins.last()).map_or(0.0, |(a, b)| 0.5 * (a.z + b.z));
+        let mut sums = Vec::with_capacity(bins.len() + 1);
+        let mut so_far = [0.0; SUMS];
+        sums.push(so_far);
+        for b in &bins {
+            let (z, s, h) = (b.z - middle, b.shell, b.height);
+            for (sum, v) in so_far.iter_mut().zip([1.0, z, z * z, s, z * s, s * s, h, z * h, s * h, h * h]) {
+                *sum += v;
+            }
+            sums.push(so_far);
+        }
+        Self { profile, bins, sums, middle, centre }
     }
 
-    fn between(&self, from: f64, to: f64) -> &[SideBin] {
-        let (first, last) = (self.profile.boundary(from), self.profile.boundary(to));
-        let at = |boundary: usize| self.bins.partition_point(|b| b.index < boundary);
-        &self.bins[at(first)..at(last).max(at(first))]
+    /// The bins of [from, to).
+    fn between(&self, from: f64, to: f64) -> std::ops::Range<usize> {
+        let at = |x: f64| {
+            let boundary = self.profile.boundary(x);
+            self.bins.partition_point(|b| b.index < boundary)
+        };
+        at(from)..at(to).max(at(from))
     }
 
     /// Mean residuals of the blocks of [from, to).
@@ -134,12 +178,12 @@ impl<'a> Side<'a> {
         let wide = self.profile.in_bins(BLOCK_MM);
         let first = self.profile.boundary(from);
         let run = *run;
-        self.between(from, to).chunk_by(move |a, b| (a.index - first) / wide == (b.index - first) / wide).map(
-            move |block| {
+        self.bins[self.between(from, to)]
+            .chunk_by(move |a, b| (a.index - first) / wide == (b.index - first) / wide)
+            .map(move |block| {
                 let off = |b: &SideBin| b.height - run.height - run.slope * b.z - run.shrinkage * b.shell;
                 block.iter().map(off).sum::<f64>() / block.len() as f64
-            },
-        )
+            })
     }
 
     fn fit(&self, from: f64, to: f64, sigma: f64) -> Option<WallRun> {
@@ -147,16 +191,10 @@ impl<'a> Side<'a> {
         if bins.len() < 4 {
             return None;
         }
-        // The slope is counted from the run's own middle, so that the sums do not cancel.
-        let middle = 0.5 * (from + to) - self.centre;
-        let row = |b: &SideBin| Vector3::new(1.0, b.z - middle, b.shell);
-        let (mut normal, mut right, mut square) = (Matrix3::zeros(), Vector3::zeros(), 0.0);
-        for b in bins {
-            let r = row(b);
-            normal += r * r.transpose();
-            right += r * b.height;
-            square += b.height * b.height;
-        }
+        let sum: [f64; SUMS] = std::array::from_fn(|k| self.sums[bins.end][k] - self.sums[bins.start][k]);
+        let [n, z, zz, s, zs, ss, h, zh, sh, square] = sum;
+        let normal = Matrix3::new(n, z, s, z, zz, zs, s, zs, ss);
+        let right = Vector3::new(h, zh, sh);
         let solve = |variance: f64| {
             let mut a = normal;
             a[(2, 2)] += variance / (SHRINKAGE_MM * SHRINKAGE_MM);
@@ -173,13 +211,12 @@ impl<'a> Side<'a> {
         Some(WallRun {
             from,
             to,
-            height: c[0] - c[1] * middle,
+            height: c[0] - c[1] * self.middle,
             slope: c[1],
             shrinkage: c[2],
             rms,
             slope_u: (variance * inverse[(1, 1)]).sqrt(),
             centre: self.centre,
-            shell_mm: self.shell_mm,
         })
     }
 }

@@ -113,6 +113,8 @@ pub(super) struct Gathered {
     pub seen: Vec<bool>,
 }
 
+/// Points that one thread gathers by itself.
+const GATHERED: usize = 16 * threads::CHUNK;
 /// A bin counts as seen when each wall has this part of the points of a typical bin: edges of the view fill bins partly.
 const SEEN_PART: f64 = 0.1;
 
@@ -154,68 +156,80 @@ struct OfShot {
     typical: [f64; 2],
 }
 
+/// The points are gathered as the shot's own frame has them, column by column from its first one on; then cells are placed.
 fn of_shot(shot: &LabelledShot, view: &SeamView, columns: &Columns, rows_mm: [f64; 2], reach: [[f64; 2]; 2]) -> OfShot {
     let course = columns.course;
-    // Cells along the stretch of this shot alone, from its first one on.
-    let cell_at = columns.spacing() * columns.of_a_cell as f64;
-    let first = columns.cell(view.middle - view.half);
-    let along = ((2.0 * view.half / cell_at).ceil() as usize + 2).min(columns.around / columns.of_a_cell);
+    let own = view.own;
+    let of_a_cell = columns.of_a_cell;
+    // Of the shot's own columns the one in the middle of its stretch lies in the middle of a cell.
+    let cells_aside = (own.half / (columns.spacing() * of_a_cell as f64)).ceil() as usize + 1;
+    let along = 2 * cells_aside + 1;
     let rows: [usize; 2] = std::array::from_fn(|k| ((reach[k][1] - reach[k][0]) / rows_mm[k]).ceil() as usize + 1);
-    let total = along * (rows[0] + rows[1]);
-    let bins = course.bins();
-    let indices: Vec<usize> = (0..shot.labels.len()).collect();
+    let (over_spacing, over_row) = (1.0 / columns.spacing(), rows_mm.map(|mm| 1.0 / mm));
+    let middle_column = (along * of_a_cell / 2) as f64;
+    let cell_middle = |cell: usize| {
+        let column = (cell * of_a_cell + of_a_cell / 2) as f64;
+        own.middle + (column - middle_column) * columns.spacing()
+    };
+    let first_row = [0, along * rows[0]];
     let parts: Vec<(Vec<CellSums>, Vec<[f64; 2]>)> = threads::install(|| {
-        indices
-            .par_chunks(16 * threads::CHUNK)
+        (0..shot.labels.len().div_ceil(GATHERED))
+            .into_par_iter()
             .inspect(polled)
-            .map(|chunk| {
-                let mut sums = vec![[0.0; 10]; total];
-                let mut counts = vec![[0.0; 2]; bins];
-                for &i in chunk {
+            .map(|part| {
+                let mut sums = vec![[0.0; 10]; along * (rows[0] + rows[1])];
+                let mut counts = vec![[0.0; 2]; along * of_a_cell];
+                for i in part * GATHERED..((part + 1) * GATHERED).min(shot.labels.len()) {
                     let Some(k) = is_wall(shot.labels[i]).map(usize::from) else { continue };
-                    let [at, across, height] = view.placed(shot.unrolled, i);
-                    counts[course.bin(at)][k] += 1.0;
-                    let column = columns.cell(at);
-                    let cell = (column + columns.around - first) % columns.around / columns.of_a_cell;
-                    let row = (((across.abs() - reach[k][0]) / rows_mm[k]).max(0.0) as usize).min(rows[k] - 1);
-                    if cell < along {
-                        let slot = &mut sums[rows[0] * k * along + cell * rows[k] + row];
-                        add(slot, course.apart(at, columns.middle(column)), across, height);
-                    }
+                    let u = shot.unrolled;
+                    let [across, height] = [u.across_mm[i], u.height_mm[i]].map(f64::from);
+                    let apart = own.course.apart(f64::from(u.at[i]), own.middle);
+                    let column = ((apart * over_spacing + middle_column + 0.5) as i32 as usize).min(counts.len() - 1);
+                    counts[column][k] += 1.0;
+                    let cell = column / of_a_cell;
+                    let row = ((across.abs() - reach[k][0]) * over_row[k]).max(0.0) as i32 as usize;
+                    let slot = first_row[k] + cell * rows[k] + row.min(rows[k] - 1);
+                    let off = apart - ((cell * of_a_cell + of_a_cell / 2) as f64 - middle_column) * columns.spacing();
+                    add(&mut sums[slot], off, across, height);
                 }
                 (sums, counts)
             })
             .collect()
     });
-    let (mut sums, mut counts) = (vec![[0.0; 10]; total], vec![[0.0; 2]; bins]);
+    let (mut sums, mut counts) = (vec![[0.0; 10]; along * (rows[0] + rows[1])], vec![[0.0; 2]; along * of_a_cell]);
     for (part, more) in parts {
         sums.iter_mut().zip(part).for_each(|(a, b)| a.iter_mut().zip(b).for_each(|(x, y)| *x += y));
         counts.iter_mut().zip(more).for_each(|(a, b)| a.iter_mut().zip(b).for_each(|(x, y)| *x += y));
     }
     let cells = std::array::from_fn(|k| {
-        let mine = &sums[rows[0] * k * along..][..along * rows[k]];
+        let mine = &sums[first_row[k]..][..along * rows[k]];
         let mut numbers: Vec<f64> = mine.iter().map(|s| s[0]).filter(|n| *n > 0.0).collect();
         let full = FULL_PART * median(&mut numbers);
         let (square, free) = mine.iter().map(scatter).fold((0.0, 0.0), |a, b| (a.0 + b.0, a.1 + b.1));
         let scatter = if free >= TELLING { (square / free).sqrt() } else { USUAL_SCATTER_MM };
         let variance = scatter.max(LEAST_SCATTER_MM).powi(2);
-        let cell = |(at, s): (usize, &CellSums)| {
-            (s[0] > 0.0 && s[0] >= full).then(|| Cell {
-                column: (first + at / rows[k] * columns.of_a_cell) % columns.around,
-                along_mm: course.along_mm(s[1] / s[0]),
-                across_mm: s[2] / s[0],
-                height_mm: s[3] / s[0],
-                weight: s[0] / variance,
-                shot: 0,
+        let cell = |(place, s): (usize, &CellSums)| {
+            (s[0] > 0.0 && s[0] >= full).then(|| {
+                let at = cell_middle(place / rows[k]) + s[1] / s[0];
+                let [at, across_mm, height_mm] = view.moved(at, s[2] / s[0], s[3] / s[0]);
+                let column = columns.cell(at);
+                let along_mm = course.along_mm(course.apart(at, columns.middle(column)));
+                Cell { column, along_mm, across_mm, height_mm, weight: s[0] / variance, shot: 0 }
             })
         };
         mine.iter().enumerate().filter_map(cell).collect()
     });
+    let mut bins = vec![[0.0; 2]; course.bins()];
+    for (column, seen) in counts.iter().enumerate() {
+        let at = own.middle + (column as f64 - middle_column) * columns.spacing();
+        let bin = &mut bins[course.bin(view.moved(at, 0.0, 0.0)[0])];
+        *bin = [bin[0] + seen[0], bin[1] + seen[1]];
+    }
     let typical = std::array::from_fn(|k| {
-        let mut numbers: Vec<f64> = counts.iter().map(|c| c[k]).filter(|n| *n > 0.0).collect();
+        let mut numbers: Vec<f64> = bins.iter().map(|c| c[k]).filter(|n| *n > 0.0).collect();
         median(&mut numbers)
     });
-    OfShot { cells, bins: counts, typical }
+    OfShot { cells, bins, typical }
 }
 
 /// The columns that all cells lie in: around the whole seam, or from the end of the longest gap on where that is long. Returns

@@ -28,7 +28,8 @@ mod tests;
 mod view;
 
 pub use profile::ProfileBin;
-pub use view::{LabelledShot, Modes};
+pub(crate) use view::Stretched;
+pub use view::{LabelledShot, Modes, OwnSurface};
 
 use super::kriging::{Asked, Largest, Scales, largest};
 use super::seam::Course;
@@ -134,8 +135,8 @@ pub struct Step {
     pub residual_rms_mm: f64,
     /// Cells of both walls.
     pub cells: usize,
-    /// Per shot: the deviation of every point from the reference wall.
-    pub deviation_mm: Vec<Vec<f32>>,
+    /// Per shot: the reference wall's surface.
+    pub surfaces: Vec<OwnSurface>,
 }
 
 impl Step {
@@ -160,54 +161,126 @@ fn largest_step(value: &[f64], covariance: &[f64]) -> Option<LargestStep> {
     Some(LargestStep { at, quantiles, interval_mm: [lower, upper], band_factor })
 }
 
+/// The shots of a seam, and all that their walls say together.
+struct Together {
+    course: Course,
+    views: Vec<SeamView>,
+    equations: SeamEquations,
+    /// Length of each wall's rows of cells, and how far it reaches.
+    rows_mm: [f64; 2],
+    reach_mm: [[f64; 2]; 2],
+    /// Bins that were seen on both walls.
+    bins: Vec<usize>,
+    posed: bool,
+}
+
+impl Together {
+    fn of(shots: &[LabelledShot]) -> Result<Self> {
+        require_count("part shots with both walls", 1, shots.len())?;
+        shots.iter().try_for_each(LabelledShot::check)?;
+        require(shots.iter().map(|s| s.labels.len()).sum(), 4);
+        let seam = common_seam(shots)?;
+        let views = shots.iter().map(|s| SeamView::of(s, &seam)).collect::<Result<Vec<SeamView>>>()?;
+        let columns = Columns::of(seam.course);
+        let gathered = gather(shots, &views, &columns)?;
+        let thickness_mm = shots.iter().map(|s| s.thickness_mm).sum::<f64>() / shots.len() as f64;
+        let posed = shots.iter().all(|s| s.base_from_scanner.is_some());
+        let bends =
+            shots.iter().zip(&views).map(|(shot, view)| Bend::of(shot, view)).collect::<Result<Option<Vec<Bend>>>>()?;
+        let bends = bends.unwrap_or_default();
+        if bends.iter().any(|b| b.count() != bends[0].count()) {
+            let (expected, got) = ("the same modes in every shot".into(), "different numbers".into());
+            return Err(Error::Shape { what: "calibration modes", expected, got });
+        }
+        let terms = Terms::new(seam.course, thickness_mm, views.iter().map(|v| v.middle).collect(), posed, bends);
+        let equations = SeamEquations::of(columns, &gathered, terms);
+        let seen = (0..gathered.seen.len()).filter(|bin| gathered.seen[*bin]);
+        let bins: Vec<usize> = seen.filter(|bin| equations.column_of_bin(*bin).is_some()).collect();
+        if bins.is_empty() {
+            return Err(Error::NotFound { what: "step", reason: "no angle at which both walls were seen".into() });
+        }
+        Ok(Self {
+            course: seam.course,
+            views,
+            equations,
+            rows_mm: gathered.walls.each_ref().map(|w| w.row_mm),
+            reach_mm: gathered.walls.each_ref().map(|w| w.reach_mm),
+            bins,
+            posed,
+        })
+    }
+
+    /// The step at the middles of bins. Several shots turn about the axis: by what the walls found in a first pass are like.
+    fn at_seam(&self, scales: &[Scales; 2]) -> Result<Solved> {
+        let solve = |equations: &SeamEquations, bins: &[usize]| {
+            let column = |bin: &usize| equations.column_of_bin(*bin).unwrap_or(0);
+            let ask = |factor: f64| -> Vec<Asked> {
+                bins.iter().map(|bin| Asked { column: column(bin), across_mm: 0.0, factor }).collect()
+            };
+            let mut rows = vec![0.0; bins.len() * equations.terms.count()];
+            for (row, bin) in rows.chunks_exact_mut(equations.terms.count()).zip(bins) {
+                equations.terms.step_row(equations.columns.course.bin_middle(*bin), row);
+            }
+            equations.solve(scales, [&ask(-1.0), &ask(1.0)], &rows)
+        };
+        if !self.posed || self.equations.terms.shots() < 2 {
+            return solve(&self.equations, &self.bins);
+        }
+        let first = solve(&self.equations, &[])?;
+        let turning = self.equations.terms.turning(&first.border.estimate);
+        solve(&self.equations.with(turning), &self.bins)
+    }
+
+    /// The step, and what is uncertain of it.
+    fn solved(&self, scales: &[Scales; 2], known: &Known) -> Result<(Solved, Uncertain)> {
+        let solved = self.at_seam(scales)?;
+        let found = Uncertain::of(&solved, &self.bins, &self.views, &self.course, known)?;
+        Ok((solved, found))
+    }
+}
+
+/// The step of one shot by itself, in its own frame: the reading of each bin, step and standard uncertainty. What its walls are like
+/// comes from all shots.
+///
+/// # Errors
+/// As [`measure`].
+pub fn alone(shot: &LabelledShot, known: &Known, like: &[FoundUnevenness; 2]) -> Result<Vec<[f64; 3]>> {
+    let together = Together::of(&[LabelledShot { base_from_scanner: None, modes: None, ..*shot }])?;
+    let scales = like.map(|u| {
+        let [along_mm, across_mm] = u.reach_mm;
+        Scales { sd_mm: u.sd_mm, along_mm, across_mm, noise: u.noise }
+    });
+    let (solved, found) = together.solved(&scales, known)?;
+    let n = together.bins.len();
+    let bin = |(k, bin): (usize, &usize)| {
+        let standard = found.covariance_mm2[k * n + k].sqrt();
+        [together.course.bin_reading(*bin), solved.answer.value[k], standard]
+    };
+    Ok(together.bins.iter().enumerate().map(bin).collect())
+}
+
 /// Measures the step on all shots together.
 ///
 /// # Errors
 /// [`Error::Shape`] where a shot's arrays differ in length, [`Error::TooFew`] without both walls in each shot,
 /// [`Error::Degenerate`] where the walls do not determine it, [`Error::NotFound`] where no bin was seen on both walls.
 pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
-    require_count("part shots with both walls", 1, shots.len())?;
-    shots.iter().try_for_each(LabelledShot::check)?;
-    require(shots.iter().map(|s| s.labels.len()).sum(), 24);
-    let seam = common_seam(shots)?;
-    let views = shots.iter().map(|s| SeamView::of(s, &seam)).collect::<Result<Vec<SeamView>>>()?;
-    let columns = Columns::of(seam.course);
-    let gathered = gather(shots, &views, &columns)?;
-    let thickness_mm = shots.iter().map(|s| s.thickness_mm).sum::<f64>() / shots.len() as f64;
-    let posed = shots.iter().all(|s| s.base_from_scanner.is_some());
-    let bends =
-        shots.iter().zip(&views).map(|(shot, view)| Bend::of(shot, view)).collect::<Result<Option<Vec<Bend>>>>()?;
-    let bends = bends.unwrap_or_default();
-    if bends.iter().any(|b| b.count() != bends[0].count()) {
-        let (expected, got) = ("the same modes in every shot".into(), "different numbers".into());
-        return Err(Error::Shape { what: "calibration modes", expected, got });
-    }
-    let terms = Terms::new(seam.course, thickness_mm, views.iter().map(|v| v.middle).collect(), posed, bends);
-    let equations = SeamEquations::of(columns, &gathered, terms);
-    let (rows_mm, reach_mm) =
-        (gathered.walls.each_ref().map(|w| w.row_mm), gathered.walls.each_ref().map(|w| w.reach_mm));
-    let bins: Vec<usize> =
-        (0..gathered.seen.len()).filter(|bin| gathered.seen[*bin] && equations.column_of_bin(*bin).is_some()).collect();
-    if bins.is_empty() {
-        return Err(Error::NotFound { what: "step", reason: "no angle at which both walls were seen".into() });
-    }
-    let bin_count = seam.course.bins();
+    let together = Together::of(shots)?;
+    let Together { course, views, equations, bins, .. } = &together;
     let near = equations.scales(None)?;
     // Walls too short to leave anything out are not told apart.
-    let guard = Guard::of(&equations, near, rows_mm, reach_mm).unwrap_or_else(|_| Guard::none(bin_count, near));
-    let (mut scales, mut solved) = (near, at_seam(&equations, &near, &bins, posed)?);
-    let mut found = Uncertain::of(&solved, &bins, &views, &seam.course, known)?;
+    let guard = Guard::of(equations, near, together.rows_mm, together.reach_mm)
+        .unwrap_or_else(|_| Guard::none(course.bins(), near));
+    let (mut scales, (mut solved, mut found)) = (near, together.solved(&near, known)?);
     let departure_limit = Guard::limit(found.largest.band_factor);
     if guard.departures.iter().flatten().any(|z| z.abs() > departure_limit) {
         // What lies beside the cap must not say what is usual.
         scales = guard.scales;
-        solved = at_seam(&equations, &scales, &bins, posed)?;
-        found = Uncertain::of(&solved, &bins, &views, &seam.course, known)?;
+        (solved, found) = together.solved(&scales, known)?;
     }
     let Solved { border, answer, terms, residuals } = &solved;
     let Uncertain { covariance_mm2, place_mm, largest } = found;
 
-    let course = seam.course;
     let n = bins.len();
     let mut profile = Vec::with_capacity(n);
     for (k, &bin) in bins.iter().enumerate() {
@@ -225,13 +298,10 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
         });
     }
     let estimate = &border.estimate;
-    let deviation_mm: Vec<Vec<f32>> = views
-        .iter()
-        .zip(shots)
-        .enumerate()
-        .map(|(k, (view, shot))| view.over(shot, |at, across| terms.reference_height(estimate, k, at, across)))
-        .collect();
-    let (mean_mm, median_mm) = mean_and_median(shots, &deviation_mm);
+    let of_shot =
+        |(k, view): (usize, &SeamView)| view.surface(|at, across| terms.reference_height(estimate, k, at, across));
+    let surfaces: Vec<OwnSurface> = views.iter().enumerate().map(of_shot).collect();
+    let (mean_mm, median_mm) = mean_and_median(shots, &surfaces);
     let told = |row: &[f64]| {
         let value: f64 = row.iter().zip(estimate).map(|(a, b)| a * b).sum();
         (value, border.spread(row)[0].sqrt())
@@ -274,7 +344,7 @@ pub fn measure(shots: &[LabelledShot], known: &Known) -> Result<Step> {
         covariance_mm2,
         departure_limit,
         profile,
-        deviation_mm,
+        surfaces,
     })
 }
 
@@ -316,25 +386,4 @@ impl Uncertain {
             .ok_or_else(|| Error::Degenerate { what: "step", reason: "its uncertainty is none".into() })?;
         Ok(Self { covariance_mm2, place_mm, largest })
     }
-}
-
-/// The step at the middles of bins. Several shots turn about the axis: by what the walls found in a first pass are like.
-fn at_seam(equations: &SeamEquations, scales: &[Scales; 2], bins: &[usize], posed: bool) -> Result<Solved> {
-    let solve = |equations: &SeamEquations, bins: &[usize]| {
-        let column = |bin: &usize| equations.column_of_bin(*bin).unwrap_or(0);
-        let ask = |factor: f64| -> Vec<Asked> {
-            bins.iter().map(|bin| Asked { column: column(bin), across_mm: 0.0, factor }).collect()
-        };
-        let mut rows = vec![0.0; bins.len() * equations.terms.count()];
-        for (row, bin) in rows.chunks_exact_mut(equations.terms.count()).zip(bins) {
-            equations.terms.step_row(equations.columns.course.bin_middle(*bin), row);
-        }
-        equations.solve(scales, [&ask(-1.0), &ask(1.0)], &rows)
-    };
-    if !posed || equations.terms.shots() < 2 {
-        return solve(equations, bins);
-    }
-    let first = solve(equations, &[])?;
-    let turning = equations.terms.turning(&first.border.estimate);
-    solve(&equations.with(turning), bins)
 }

@@ -111,12 +111,75 @@ pub(super) struct SeamView {
     pub middle: f64,
     pub half: f64,
     /// The same in the shot's own frame, which the table is over.
-    own_middle: f64,
-    own_half: f64,
+    pub own: Stretched,
     /// What is added to place along, place across and height in the shot's own frame: constant, and per mm across.
     table: Vec<[f64; 6]>,
     /// How far each wall reaches from the centreline: from, to.
     pub reach_mm: [[f64; 2]; 2],
+}
+
+/// A stretch of a shot's own seam, which tables are over.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Stretched {
+    pub(crate) course: Course,
+    pub(crate) middle: f64,
+    pub(crate) half: f64,
+}
+
+impl Stretched {
+    /// Where a place lies in a table: the entry before it, and how far it is on to the next; beyond the stretch (nothing of the weld
+    /// is there) that of its end.
+    #[inline]
+    fn slot(&self, at: f64) -> (usize, f64) {
+        let local = self.course.apart(at, self.middle) / self.half;
+        let place = ((local + 1.0) / 2.0 * TABLE as f64).clamp(0.0, TABLE as f64 - 1e-9);
+        // A point that is none has no place.
+        let k = place as i32 as usize;
+        (k, place - k as f64)
+    }
+
+    /// The place of an entry.
+    fn place(&self, entry: usize) -> f64 {
+        self.middle + self.half * (2.0 * entry as f64 / TABLE as f64 - 1.0)
+    }
+}
+
+/// What a pass over a shot's points tells of its walls.
+struct Extent {
+    count: [usize; 2],
+    half: f64,
+    far: f64,
+    reach_mm: [[f64; 2]; 2],
+}
+
+impl Extent {
+    const NONE: Self = Self { count: [0; 2], half: 0.0, far: 1.0, reach_mm: [[f64::INFINITY, 0.0]; 2] };
+
+    fn of(shot: &LabelledShot, middle: f64) -> Self {
+        let (own, u) = (shot.seam.course, shot.unrolled);
+        let parts = threads::map_ranges(shot.labels.len(), |range| {
+            let mut part = Self::NONE;
+            for i in range {
+                let Some(k) = is_wall(shot.labels[i]).map(usize::from) else { continue };
+                let across = f64::from(u.across_mm[i].abs());
+                part.count[k] += 1;
+                part.half = part.half.max(own.apart(f64::from(u.at[i]), middle).abs());
+                part.reach_mm[k] = [part.reach_mm[k][0].min(across), part.reach_mm[k][1].max(across)];
+            }
+            part
+        });
+        let mut all = Self::NONE;
+        for part in parts {
+            all.half = all.half.max(part.half);
+            for k in 0..2 {
+                all.count[k] += part.count[k];
+                let [from, to] = part.reach_mm[k];
+                all.reach_mm[k] = [all.reach_mm[k][0].min(from), all.reach_mm[k][1].max(to)];
+                all.far = all.far.max(to);
+            }
+        }
+        all
+    }
 }
 
 impl SeamView {
@@ -127,33 +190,22 @@ impl SeamView {
         // Any place about the middle will do to count from.
         let some = (0..shot.labels.len()).step_by(MIDDLE_STRIDE).filter(|i| is_wall(shot.labels[*i]).is_some());
         let own_middle = own.middle(some.map(|i| u.at[i]));
-        let walls =
-            |range: std::ops::Range<usize>| range.filter_map(|i| Some((i, usize::from(is_wall(shot.labels[i])?))));
-        let (mut count, mut own_half, mut far) = ([0_usize; 2], 0.0_f64, 1.0_f64);
-        for (more, half, reach) in threads::map_ranges(shot.labels.len(), |range| {
-            let (mut count, mut half, mut far) = ([0_usize; 2], 0.0_f64, 1.0_f64);
-            for (i, k) in walls(range) {
-                count[k] += 1;
-                half = half.max(own.apart(f64::from(u.at[i]), own_middle).abs());
-                far = far.max(f64::from(u.across_mm[i].abs()));
-            }
-            (count, half, far)
-        }) {
-            count = [count[0] + more[0], count[1] + more[1]];
-            (own_half, far) = (own_half.max(half), far.max(reach));
-        }
-        for (what, n) in [("points of the reference wall", count[0]), ("points of the other wall", count[1])] {
+        let extent = Extent::of(shot, own_middle);
+        let walls = [("points of the reference wall", extent.count[0]), ("points of the other wall", extent.count[1])];
+        for (what, n) in walls {
             require_count(what, 100, n)?;
         }
-        if own_half <= 0.0 {
+        if extent.half <= 0.0 {
             return Err(Error::Degenerate { what: "step", reason: "all points lie at one angle".into() });
         }
         let placed = |at: f64, across: f64| {
             let Some(base_from_scanner) = &shot.base_from_scanner else { return [at, across, 0.0] };
             common.place(&base_from_scanner.apply(&shot.seam.point(at, across)).into())
         };
+        let stretch = Stretched { course: own, middle: own_middle, half: extent.half };
+        let far = extent.far;
         let entry = |k: usize| {
-            let at = own_middle + own_half * (2.0 * k as f64 / TABLE as f64 - 1.0);
+            let at = stretch.place(k);
             let ends = [-far, far].map(|across| {
                 let [a, z, h] = placed(at, across);
                 [own.apart(a, at), z - across, h]
@@ -163,75 +215,77 @@ impl SeamView {
             [mean(0), mean(1), mean(2), slope(0), slope(1), slope(2)]
         };
         let course = common.course;
-        let mut view = Self {
-            course,
-            middle: own_middle,
-            half: own_half,
-            own_middle,
-            own_half,
-            table: (0..=TABLE).map(entry).collect(),
-            reach_mm: [[f64::INFINITY, 0.0]; 2],
-        };
-        view.middle = course.apart(own_middle + view.entry(own_middle)[0], 0.0);
-        let parts = threads::map_ranges(shot.labels.len(), |range| {
-            let (mut half, mut reach) = (0.0_f64, [[f64::INFINITY, 0.0]; 2]);
-            for (i, k) in walls(range) {
-                let [at, across, _] = view.placed(u, i);
-                half = half.max(course.apart(at, view.middle).abs());
-                reach[k] = [reach[k][0].min(across.abs()), reach[k][1].max(across.abs())];
+        let table: Vec<[f64; 6]> = (0..=TABLE).map(entry).collect();
+        let mut view =
+            Self { course, middle: 0.0, half: 0.0, own: stretch, table, reach_mm: [[f64::INFINITY, 0.0]; 2] };
+        view.middle = course.apart(view.moved(own_middle, 0.0, 0.0)[0], 0.0);
+        // How far the walls reach about the common seam: by the corners of their stretch.
+        for at in [0, TABLE / 2, TABLE].map(|k| stretch.place(k)) {
+            for (k, sign) in [(0, -1.0), (1, 1.0)] {
+                for (end, mm) in extent.reach_mm[k].into_iter().enumerate() {
+                    let [along, across, _] = view.moved(at, sign * mm, 0.0);
+                    view.half = view.half.max(course.apart(along, view.middle).abs());
+                    let reach = &mut view.reach_mm[k][end];
+                    *reach = if end == 0 { reach.min(across.abs()) } else { reach.max(across.abs()) };
+                }
             }
-            (half, reach)
-        });
-        view.half = parts.iter().map(|p| p.0).fold(0.0, f64::max);
-        view.reach_mm = std::array::from_fn(|k| {
-            let all = parts.iter().map(|p| p.1[k]);
-            all.fold([f64::INFINITY, 0.0], |a, b| [a[0].min(b[0]), f64::max(a[1], b[1])])
-        });
+        }
         Ok(view)
     }
 
-    /// The table at a place in the shot's own frame; beyond the walls' stretch (nothing of the weld is there) that of its end.
+    /// Place along and across, and height, about the common seam of what lies there in the shot's own frame.
     #[inline]
-    fn entry(&self, own: f64) -> [f64; 6] {
-        let local = self.course.apart(own, self.own_middle) / self.own_half;
-        let place = ((local + 1.0) / 2.0 * TABLE as f64).clamp(0.0, TABLE as f64 - 1e-9);
-        let (k, part) = (place as usize, place.fract());
+    pub fn moved(&self, at: f64, across: f64, height: f64) -> [f64; 3] {
+        let (k, part) = self.own.slot(at);
         let (a, b) = (&self.table[k], &self.table[k + 1]);
-        std::array::from_fn(|c| a[c] + part * (b[c] - a[c]))
-    }
-
-    /// A point's place along and across, and its height, about the common seam.
-    #[inline]
-    pub fn placed(&self, unrolled: &Unrolled, i: usize) -> [f64; 3] {
-        let (at, across) = (f64::from(unrolled.at[i]), f64::from(unrolled.across_mm[i]));
-        let e = self.entry(at);
-        let height = f64::from(unrolled.height_mm[i]);
+        let e: [f64; 6] = std::array::from_fn(|c| a[c] + part * (b[c] - a[c]));
         [at + e[0] + e[3] * across, across + e[1] + e[4] * across, height + e[2] + e[5] * across]
     }
 
-    /// Every point's height over a surface that is given about the common seam, place along and across.
-    pub fn over(&self, shot: &LabelledShot, surface: impl Fn(f64, f64) -> f64) -> Vec<f32> {
-        let table: Vec<[f64; 2]> = (0..=TABLE)
-            .map(|k| {
-                let own = self.own_middle + self.own_half * (2.0 * k as f64 / TABLE as f64 - 1.0);
-                let [at, across, height, _, _, lean] = self.table[k];
-                let here = own + at;
-                let [low, high] = [-1.0, 1.0].map(|z| surface(here, across + z));
-                [height - (low + high) / 2.0, lean - (high - low) / 2.0]
-            })
-            .collect();
-        let unrolled = shot.unrolled;
-        threads::map_ranges(shot.labels.len(), |range| {
-            let one = |i: usize| {
-                let local = self.course.apart(f64::from(unrolled.at[i]), self.own_middle) / self.own_half;
-                let place = ((local + 1.0) / 2.0 * TABLE as f64).clamp(0.0, TABLE as f64 - 1e-9);
-                // A point that is none has no place.
-                let (k, part) = (place as usize, place.fract());
-                let blend = |c: usize| table[k][c] + part * (table[k + 1][c] - table[k][c]);
-                (f64::from(unrolled.height_mm[i]) + blend(0) + f64::from(unrolled.across_mm[i]) * blend(1)) as f32
-            };
-            range.map(one).collect::<Vec<f32>>()
-        })
-        .concat()
+    /// A point's place along and across, and its height, about the common seam.
+    pub fn placed(&self, unrolled: &Unrolled, i: usize) -> [f64; 3] {
+        let [at, across, height] = [unrolled.at[i], unrolled.across_mm[i], unrolled.height_mm[i]].map(f64::from);
+        self.moved(at, across, height)
+    }
+
+    /// A surface that is given about the common seam, place along and across, as the shot's own frame has it.
+    pub fn surface(&self, surface: impl Fn(f64, f64) -> f64) -> OwnSurface {
+        let entry = |k: usize| {
+            let [at, across, height, _, _, lean] = self.table[k];
+            let here = self.own.place(k) + at;
+            let [low, high] = [-1.0, 1.0].map(|z| surface(here, across + z));
+            [height - (low + high) / 2.0, lean - (high - low) / 2.0]
+        };
+        OwnSurface { stretch: self.own, table: (0..=TABLE).map(entry).collect() }
+    }
+}
+
+/// The reference wall's surface, of all shots together, in one shot's own frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OwnSurface {
+    pub(crate) stretch: Stretched,
+    /// What is added to a height: constant, and per mm across.
+    pub(crate) table: Vec<[f64; 2]>,
+}
+
+impl OwnSurface {
+    /// The wall of the shot's own frame, so far inside.
+    #[cfg(test)]
+    pub(crate) fn flat(course: Course, inside_mm: f64) -> Self {
+        Self { stretch: Stretched { course, middle: 0.0, half: 1.0 }, table: vec![[inside_mm, 0.0]; TABLE + 1] }
+    }
+
+    /// How far a point stands off it; NaN where there is none.
+    #[inline]
+    pub fn deviation(&self, unrolled: &Unrolled, i: usize) -> f32 {
+        let (k, part) = self.stretch.slot(f64::from(unrolled.at[i]));
+        let blend = |c: usize| self.table[k][c] + part * (self.table[k + 1][c] - self.table[k][c]);
+        (f64::from(unrolled.height_mm[i]) + blend(0) + f64::from(unrolled.across_mm[i]) * blend(1)) as f32
+    }
+
+    /// The same of every point.
+    pub fn deviations(&self, unrolled: &Unrolled) -> Vec<f32> {
+        let of = |range: std::ops::Range<usize>| range.map(|i| self.deviation(unrolled, i)).collect::<Vec<f32>>();
+        threads::map_ranges(unrolled.at.len(), of).concat()
     }
 }

@@ -103,8 +103,8 @@ def inspect(
             not corrected.
         required_coverage_deg: how much of the seam must be seen for a PASS, 360 for all of it; by default what the
             session's `part.required_coverage_deg` says.
-        cloud: `all`: every point that was measured is in `Inspection.cloud`; `cells`: of more than 4 million one of every cell
-            of 0.15 mm of the unrolled part, that of the first shot that saw it.
+        cloud: `all`: every point that was measured is in `Inspection.cloud`; `cells`: of more than 4 million one of
+            every cell of 0.15 mm of the unrolled part, that of the first shot that saw it.
         progress: called with (done, total, what) while it works.
         reader: makes what turns a shot into points, from the session, `progress` and what to do about the response: by
             default from the shot's images.
@@ -323,8 +323,10 @@ class _Run:
         """All shots in base, in one cloud."""
         shots = [(view.shot, view.base_from_scanner, view.index) for view in views]
         many = sum(int(np.count_nonzero(np.isfinite(view.shot.deviation_mm))) for view in views) > MOST_POINTS
-        *arrays, counts = place_shots(step, shots, CELL_MM if many and self.cloud == "cells" else None)
-        return PartCloud(*arrays, tuple(counts))
+        points, label, deviation, along, across, shot, counts = place_shots(
+            step, shots, CELL_MM if many and self.cloud == "cells" else None
+        )
+        return PartCloud(points, label, deviation, along, across, shot, tuple(counts))
 
     def hold_together(
         self, views: Sequence[PartView], step: WeldStep, hand_eye: HandEye

@@ -23,8 +23,8 @@ class Label(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class PartCloud:
-    """The measured points of the part, in base (in the scanner's frame where there is no robot): all of them, or one of every
-    cell of the unrolled part.
+    """The measured points of the part, in base (in the scanner's frame where there is no robot): all of them, or one of
+    every cell of the unrolled part.
     """
 
     points_mm: Floats

@@ -56,7 +56,7 @@ const FIELDS: [&str; 23] = [
 type LargestOf<'py> = (f64, f64, Bound<'py, PyArray1<f64>>, f64);
 
 /// Readings, steps and standard uncertainties.
-type Alone<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>);
+type AloneArrays<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>);
 
 /// The step of the other wall over the reference wall (see `measure_step`).
 ///
@@ -256,7 +256,7 @@ impl WeldStep {
     /// The step as one shot tells it by itself, in its own frame: readings (n,), step and standard uncertainty (k = 1, mm), bin by
     /// bin. What its walls' unevenness is like comes from all shots. Raises GeometryError where its walls do not determine it.
     #[pyo3(signature = (shot, angle_sigma_rad=0.0))]
-    fn alone<'py>(&self, py: Python<'py>, shot: &WeldShot, angle_sigma_rad: f64) -> PyResult<Alone<'py>> {
+    fn alone<'py>(&self, py: Python<'py>, shot: &WeldShot, angle_sigma_rad: f64) -> PyResult<AloneArrays<'py>> {
         let known = Known { at: angle_sigma_rad };
         let found = compute(py, || step::alone(&labelled(shot), &known, &self.0.unevenness))?;
         let column = |k: usize| found.iter().map(|b| b[k]).collect::<Vec<f64>>().into_pyarray(py);

@@ -65,7 +65,7 @@ fn take<'a, T>(rest: &mut &'a mut [T], n: usize) -> &'a mut [T] {
 }
 
 /// Which cells of the unrolled part hold a point.
-struct Cells {
+struct TakenCells {
     cell_mm: f64,
     from_mm: f64,
     across: usize,
@@ -74,7 +74,7 @@ struct Cells {
     taken: Vec<u64>,
 }
 
-impl Cells {
+impl TakenCells {
     fn of(scans: &[Scan], cell_mm: f64) -> Result<Self> {
         require_positive("cell_mm", cell_mm)?;
         let mut range = [0.0_f64; 2];
@@ -118,7 +118,7 @@ impl Cells {
 
 /// Which points of each shot are kept, and how many have each label.
 fn kept(scans: &[Scan], cell_mm: Option<f64>) -> Result<(Vec<Vec<u32>>, [usize; LABELS])> {
-    let mut cells = cell_mm.map(|mm| Cells::of(scans, mm)).transpose()?;
+    let mut cells = cell_mm.map(|mm| TakenCells::of(scans, mm)).transpose()?;
     let mut counts = [0; LABELS];
     let mut all = Vec::with_capacity(scans.len());
     for s in scans {

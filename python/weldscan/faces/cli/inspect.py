@@ -90,7 +90,8 @@ def inspect(
     cloud: Annotated[
         Cloud,
         typer.Option(
-            help="What cloud.ply holds. cells: of more than 4 million points one of every cell of 0.15 mm; all: every point."
+            help="What cloud.ply holds. cells: of more than 4 million points one of every cell of 0.15 mm; all: every "
+            "point."
         ),
     ] = Cloud.cells,
     as_json: Annotated[

@@ -15,8 +15,9 @@ const LEAST_SHARE: f64 = 1e-5;
 #[derive(Debug, Clone)]
 pub(super) struct Basis {
     rows_mm: Vec<f64>,
-    /// Rows x rank: `sd U Λ^-1/2`.
-    shapes: DMatrix<f64>,
+    rank: usize,
+    /// Row by row, each of the rank: `sd U Λ^-1/2`.
+    shapes: Vec<f64>,
     length_mm: f64,
     variance: f64,
 }
@@ -30,25 +31,22 @@ impl Basis {
         let largest = eigen.eigenvalues.max();
         let mut kept: Vec<usize> = (0..n).filter(|&k| eigen.eigenvalues[k] > LEAST_SHARE * largest).collect();
         kept.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
-        let shapes = DMatrix::from_fn(n, kept.len(), |i, k| {
-            sd_mm * eigen.eigenvectors[(i, kept[k])] / eigen.eigenvalues[kept[k]].sqrt()
-        });
-        Self { rows_mm: rows_mm.to_vec(), shapes, length_mm, variance: sd_mm * sd_mm }
+        let shape = |i: usize, k: &usize| sd_mm * eigen.eigenvectors[(i, *k)] / eigen.eigenvalues[*k].sqrt();
+        let shapes = (0..n).flat_map(|i| kept.iter().map(move |k| shape(i, k))).collect();
+        Self { rows_mm: rows_mm.to_vec(), rank: kept.len(), shapes, length_mm, variance: sd_mm * sd_mm }
     }
 
     /// How many shapes there are.
     pub fn rank(&self) -> usize {
-        self.shapes.ncols()
+        self.rank
     }
 
     /// Their values at a place across.
     pub fn at(&self, across_mm: f64, out: &mut [f64]) {
         out.fill(0.0);
-        for (i, row) in self.rows_mm.iter().enumerate() {
+        for (row, shapes) in self.rows_mm.iter().zip(self.shapes.chunks_exact(self.rank.max(1))) {
             let k = matern(across_mm - row, self.length_mm);
-            for (m, slot) in out.iter_mut().enumerate() {
-                *slot += k * self.shapes[(i, m)];
-            }
+            out.iter_mut().zip(shapes).for_each(|(slot, shape)| *slot += k * shape);
         }
     }
 

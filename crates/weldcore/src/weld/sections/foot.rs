@@ -98,7 +98,7 @@ mod tests {
 
     fn end(profile: &Profile, toe: f64) -> Option<f64> {
         let found = foot(profile, toe, -5.0, 1.0, 0.005)?;
-        let wall = walls::grow(profile, toe, 0.0, Some(60.0), 0.005).unwrap();
+        let wall = walls::grow(profile, toe, 0.0, &walls::ShellTable::new(Some(60.0)), 0.005).unwrap();
         flare(profile, found, 0.0, &wall)
     }
 

@@ -220,3 +220,35 @@ impl<'a> Side<'a> {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_table_is_the_term() {
+        for shell_mm in [3.0, 12.0, 60.0] {
+            let table = ShellTable::new(Some(shell_mm));
+            let off = |k: i32| {
+                let z = 0.037 * f64::from(k) * shell_mm / 3.0;
+                (table.at(z) - shell_term(z, Some(shell_mm))).abs()
+            };
+            assert!((-900..900).map(off).fold(0.0, f64::max) < 1e-3, "{shell_mm}");
+        }
+        assert_eq!(ShellTable::new(None).at(0.0), 0.0);
+    }
+
+    #[test]
+    fn a_wall_with_its_shrinkage_is_one_wall() {
+        // Drawn in by 0.3 mm beside the weld, leaning, a hole in it.
+        let shell = ShellTable::new(Some(20.0));
+        let height = |x: f64| 0.4 + 0.002 * x - 0.3 * shell_term(x, Some(20.0));
+        let scatter = |i: usize| 0.002 * (((i * 7919) % 13) as f64 / 6.0 - 1.0);
+        let at = |i: usize| 0.125 + 0.25 * i as f64;
+        let heights =
+            (0..360).map(|i| if (100..130).contains(&i) { f64::NAN } else { height(at(i)) + scatter(i) }).collect();
+        let run = grow(&Profile::new(0.0, 0.25, heights), 5.0, 0.0, &shell, 0.002).unwrap();
+        assert!((run.from - 5.0).abs() < 0.26 && (run.slope - 0.002).abs() < 2e-5 && run.rms < 0.002, "{run:?}");
+        assert!((run.shrinkage + 0.3).abs() < 0.02 && (run.straight(0.0) - 0.4).abs() < 0.002, "{run:?}");
+    }
+}

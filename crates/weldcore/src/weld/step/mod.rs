@@ -28,6 +28,7 @@ mod tests;
 mod view;
 
 pub use profile::ProfileBin;
+#[cfg(feature = "python")]
 pub(crate) use view::Stretched;
 pub use view::{LabelledShot, Modes, OwnSurface};
 

@@ -130,7 +130,7 @@ fn shots_join_in_one_profile_and_each_keeps_its_reference() {
     let (_, twice) = measured(&[EXAMPLE, Example { seed: 7, ..EXAMPLE }]);
     assert_eq!(alone.profile.len(), twice.profile.len());
     assert!(largest_error(&twice, &EXAMPLE) < STEP_TOLERANCE_MM);
-    assert_eq!(twice.deviation_mm.len(), 2);
+    assert_eq!(twice.surfaces.len(), 2);
 }
 
 #[test]

@@ -145,14 +145,14 @@ impl Stretched {
 }
 
 /// What a pass over a shot's points tells of its walls.
-struct Extent {
+struct WallExtent {
     count: [usize; 2],
     half: f64,
     far: f64,
     reach_mm: [[f64; 2]; 2],
 }
 
-impl Extent {
+impl WallExtent {
     const NONE: Self = Self { count: [0; 2], half: 0.0, far: 1.0, reach_mm: [[f64::INFINITY, 0.0]; 2] };
 
     fn of(shot: &LabelledShot, middle: f64) -> Self {
@@ -190,7 +190,7 @@ impl SeamView {
         // Any place about the middle will do to count from.
         let some = (0..shot.labels.len()).step_by(MIDDLE_STRIDE).filter(|i| is_wall(shot.labels[*i]).is_some());
         let own_middle = own.middle(some.map(|i| u.at[i]));
-        let extent = Extent::of(shot, own_middle);
+        let extent = WallExtent::of(shot, own_middle);
         let walls = [("points of the reference wall", extent.count[0]), ("points of the other wall", extent.count[1])];
         for (what, n) in walls {
             require_count(what, 100, n)?;

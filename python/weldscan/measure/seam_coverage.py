@@ -189,8 +189,9 @@ def _stations_by_bin(view: PartView) -> dict[int, NDArray[np.intp]]:
     shot, course = view.shot, view.shot.seam.course
     readings = shot.sections["along"]
     half = course.bin_width / 2 + course.reading_of_mm(shot.station_mm / 2)
-    off = [np.abs(course.apart(readings, course.bin_width * k)) < half for k in range(course.bins)]
-    return {k: np.flatnonzero(near) for k, near in enumerate(off) if near.any()}
+    off = readings[None, :] - course.bin_width * np.arange(course.bins)[:, None]
+    near = np.abs(course.apart(off.ravel(), 0.0)).reshape(off.shape) < half
+    return {int(k): np.flatnonzero(near[k]) for k in np.flatnonzero(near.any(axis=1))}
 
 
 def expected_bins(views: Sequence[PartView], scanner: Scanner) -> set[int]:

@@ -126,13 +126,14 @@ fn sort_points(sections: &Sections, unrolled: &Unrolled, thickness_mm: f64) -> (
     let beds: Vec<Option<Bed>> = (0..own.len()).map(|k| near(k).find_map(|j| *own.get(j)?)).collect();
     let tolerance = TOLERANCE_MM.max(5.0 * sections.noise_mm) + 4.0 * sections.noise_mm;
     let gate = GATE_THICKNESSES * thickness_mm;
+    let station = grid.stations_within(CORNER_STATIONS);
     let sort = |i: usize| -> (Fate, Label) {
         let p = grid.place(unrolled, i);
         if !p.height.is_finite() {
             return (Fate::None, Label::None);
         }
         // Beyond the stations there is nothing of the seam.
-        let Some(k) = grid.station_within(p.along, CORNER_STATIONS) else { return (Fate::Other, Label::None) };
+        let Some(k) = station(p.along) else { return (Fate::Other, Label::None) };
         let Some(bed) = &beds[k] else {
             return (if p.height.abs() > gate { Fate::Gated } else { Fate::Other }, Label::None);
         };

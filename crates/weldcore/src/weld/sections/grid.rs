@@ -17,6 +17,8 @@ const POINTS_PER_CELL: f64 = 3.0;
 const LEAST_POINTS: usize = 2;
 /// Cells with so many points tell the noise.
 const NOISE_POINTS: usize = 6;
+/// The outermost points belong to the outermost stations.
+const OUTERMOST: f64 = 0.5;
 /// Of about so many.
 const NOISE_CELLS: usize = 2000;
 /// Of every so many points one tells how far the view reaches.
@@ -103,23 +105,14 @@ impl Grid {
         }
     }
 
-    /// The station of a place along the seam; the outermost points belong to the outermost stations.
-    #[inline]
-    pub fn station(&self, along: f64) -> Option<usize> {
-        self.station_within(along, 0.5)
-    }
-
-    /// The same up to so many stations beyond the outermost ones: the corners of a view.
-    #[inline]
-    pub fn station_within(&self, along: f64, beyond: f64) -> Option<usize> {
-        let k = (along - self.start_along) / self.station_mm;
-        (k > -beyond && k < self.stations as f64 + beyond).then(|| (k.max(0.0) as i32 as usize).min(self.stations - 1))
-    }
-
-    #[inline]
-    fn bin(&self, across: f64) -> Option<usize> {
-        let k = (across - self.start_across) / self.bin_mm;
-        (k >= 0.0 && k < self.bins as f64).then_some(k as i32 as usize)
+    /// Tells the station of a place along the seam; what lies up to so many stations beyond the outermost ones belongs to those.
+    pub fn stations_within(&self, beyond: f64) -> impl Fn(f64) -> Option<usize> + use<> {
+        let (over, last) = (1.0 / self.station_mm, self.stations as i32 - 1);
+        let (start, end) = (self.start_along, f64::from(last + 1) + beyond);
+        move |along| {
+            let k = (along - start) * over;
+            (k > -beyond && k < end).then(|| (k.max(0.0) as i32).min(last) as usize)
+        }
     }
 
     /// Middle of a station, in the seam's parameter.
@@ -149,10 +142,13 @@ impl Grid {
 
     fn take_medians(&mut self, unrolled: &Unrolled) {
         let cells = self.stations * self.bins;
+        let station = self.stations_within(OUTERMOST);
+        let (over, bins) = (1.0 / self.bin_mm, self.bins as f64);
         let cell_of = |i: usize| {
             let p = self.place(unrolled, i);
-            p.height.is_finite().then_some(())?;
-            Some(self.station(p.along)? * self.bins + self.bin(p.across)?)
+            let k = (p.across - self.start_across) * over;
+            (p.height.is_finite() && k >= 0.0 && k < bins).then_some(())?;
+            Some(station(p.along)? * self.bins + k as i32 as usize)
         };
         // Points of no cell are those of one more.
         let mut cell: Vec<u32> = vec![0; unrolled.at.len()];

@@ -4,8 +4,8 @@ import time
 
 import numpy as np
 import pytest
-from small_cell import small_scanner
 
+from small_cell import small_scanner
 from weldscan.devices import backend
 from weldscan.devices.projectors.patterns import flat_pattern, fringe_patterns
 from weldscan.simulated import DEFAULT

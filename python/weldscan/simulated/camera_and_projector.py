@@ -4,7 +4,8 @@ Camera and projector are two halves of one scanner, so they share what is on the
 the camera asks the simulated controller, as it would be known to the light: `controller` is a robot link of its own.
 
 Time is as in a real cell: a pattern stands from the projector's next refresh on, a frame takes its exposure, and one
-that began too early shows the pattern before, or something of both. What a pose shows is computed once for all patterns.
+that began too early shows the pattern before, or something of both. What a pose shows is computed once, for all
+patterns.
 """
 
 from __future__ import annotations

@@ -78,3 +78,15 @@ def test_what_is_asked_for_in_one_refresh_is_the_last(devices):
     time.sleep(projector.settle_s)
     black = camera.capture().image
     np.testing.assert_array_equal(black, level(camera, projector, 0))
+
+
+def test_what_is_prepared_is_what_is_seen(devices):
+    """`scan` tells the camera that the robot has come: what a pose shows is computed while it comes to rest."""
+    camera, projector = devices
+    asked = time.monotonic()
+    camera.prepare()
+    assert time.monotonic() - asked < 0.1
+    camera._own_thread().submit(int).result(60)
+    prepared = camera._rendered
+    np.testing.assert_array_equal(level(camera, projector, 255), prepared.white[0])
+    assert camera._rendered is prepared

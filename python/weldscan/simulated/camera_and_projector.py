@@ -133,6 +133,10 @@ class VirtualCamera(Camera):
     def _set_exposure(self, exposure_s: float) -> float:
         return exposure_s
 
+    def prepare(self) -> None:
+        """Begin to compute what is seen from here; what goes wrong with it is told by the next question."""
+        self._own_thread().submit(self._render)
+
     def _grab(self, deadline_s: float) -> NDArray[Any]:
         began_s = time.monotonic()
         time.sleep(self.exposure_s)

@@ -125,6 +125,9 @@ class Camera(abc.ABC):
         self.exposure_s = actual
         return actual
 
+    def prepare(self) -> None:  # noqa: B027 - most cameras have nothing to prepare
+        """Told when the robot has come to where the next frames are taken: what takes time may begin."""
+
     def capture(self) -> Frame:
         """Return one whole frame whose exposure began after the call."""
         give_up_s = time.monotonic() + self.settings.timeout_s + self.exposure_s

@@ -655,7 +655,7 @@ def test_killed_at_random_moments(tmp_path, soak, part):
             cell.assert_whole()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_ctrl_c_ends_cleanly_and_says_how_to_go_on(cell, number):
     cell.arm.speed_mm_s = 10.0
     scanning = start(cell)

@@ -625,6 +625,7 @@ def run_or_kill(scanning, after_s):
     return "".join(lines)
 
 
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize("part", range(4))
 def test_killed_at_random_moments(tmp_path, soak, part):
     """SIGKILL, then --resume, again and again: nothing that was acknowledged is lost, and nothing half is read."""

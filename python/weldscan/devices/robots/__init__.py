@@ -222,6 +222,8 @@ class Robot(abc.ABC):
                 "Look at the robot"
             )
         try:
+            with contextlib.suppress(DeviceError):  # on a line without connections an old reply may still be on its way
+                self.pose(deadline)
             while True:
                 before = self.pose(deadline)
                 time.sleep(POLL_S)

@@ -1,6 +1,6 @@
 # Two commands matter: `make demo` and `make test`. Both set everything up first.
 .DEFAULT_GOAL := help
-.PHONY: help setup build demo test check format bench docs clean
+.PHONY: help setup build demo test soak check format bench docs clean
 PYTHON ?= python3
 PROFILE ?= release
 VENV := .venv
@@ -40,6 +40,10 @@ demo: build ## a simulated cell, measured: summary and report
 test: build $(VENV)/.peers ## every test, Rust and Python
 	cargo test --locked --workspace --profile fast
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+
+soak: build $(VENV)/.peers ## the attacks on the live cell in full: kills, interrupts, EIO, full disks, hostile links; an hour
+	$(BIN)/python -m pytest --soak -n 2 --dist load --durations 0 --durations-min 1 tests/station/test_campaigns.py \
+	  tests/station/test_scan.py tests/devices/test_hostile_links.py tests/devices/test_robot_peers.py
 
 check: build ## format, lints, types, import contracts, documentation
 	cargo fmt --all --check

@@ -25,7 +25,7 @@ from weldscan import DeviceError, KukaPose
 from weldscan.devices import backend
 from weldscan.devices.projectors.patterns import fringe_patterns
 from weldscan.devices.robots import Robot, distance
-from weldscan.records.shot import left_out
+from weldscan.records.shot import left_out, read_manifest
 from weldscan.simulated import DEFAULT, session_document
 from weldscan.simulated.controllers import Arm
 from weldscan.simulated.controllers.kvp import KvpController
@@ -71,6 +71,12 @@ def links(count: int) -> None:
 @contextmanager
 def fake_gige() -> Iterator[str | None]:
     """Aravis's fake camera, by its name; None where it is not installed."""
+    try:
+        backend("camera", "aravis").available()
+    except DeviceError as error:
+        print(error)
+        yield None
+        return
     if shutil.which("arv-fake-gv-camera-0.8") is None:
         print("arv-fake-gv-camera-0.8 is not installed")
         yield None
@@ -138,10 +144,14 @@ def a_shot(camera: dict[str, Any]) -> None:
         result = scan(cell, Path(folder) / "out")
         if result.whole != len(plan["shots"]) or left_out(result.folder):
             raise SystemExit(f"{camera['backend']}: {result}")
-        shot = {what: seconds / result.whole for what, seconds in result.seconds.items()}
-        images = sum(shot[what] for what in ("projector", "camera", "judging"))
-        parts = ", ".join(f"{what} {seconds:.2f}" for what, seconds in shot.items())
-        print(f"{camera['backend']:16} {images:5.2f} s for the images of a shot; in all {parts}")
+        each = [read_manifest(path.parent).record["seconds"] for path in result.folder.rglob("shot.json")]
+        images = [sum(shot[what] for what in ("projector", "camera", "judging")) for shot in each]
+        mean = {what: seconds / result.whole for what, seconds in result.seconds.items()}
+        parts = ", ".join(f"{what} {seconds:.2f}" for what, seconds in mean.items())
+        print(
+            f"{camera['backend']:10} images of a shot {statistics.mean(images):.2f} s, the longest {max(images):.2f}, "
+            f"with motion and standing {max(sum(shot.values()) for shot in each):.2f}; on average {parts}"
+        )
 
 
 if __name__ == "__main__":

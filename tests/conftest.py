@@ -35,7 +35,7 @@ def rsi_cycles(soak: bool) -> int:
 @pytest.fixture(autouse=True)
 def signals() -> Iterator[None]:
     """A command that ran in this process leaves the signals as the end of a process needs them: put back."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     yield
     for number, handler in before.items():
         signal.signal(number, handler)

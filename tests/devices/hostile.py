@@ -275,26 +275,23 @@ def tcp_cases(count: int) -> Iterator[tuple[str, int]]:
 # --- whoever asked for a motion goes away -----------------------------------------------------------------------------
 
 MOVER = """
-import signal, sys
+import sys
 from weldscan import DeviceError, KukaPose
 from weldscan.devices import backend
+from weldscan.faces.cli import boundary
 
-def stop(*_):
-    raise KeyboardInterrupt
+def move():
+    robot = backend("robot", sys.argv[1])
+    port = sys.argv[2] if sys.argv[1] == "serial" else int(sys.argv[2])
+    client = robot(robot.Settings(port=port, allow_motion=True, timeout_s=1.0, reconnect_s=1.0))
+    try:
+        print("ready", flush=True)
+        sys.stdin.readline()
+        print("arrived", client.move_to(KukaPose(*map(float, sys.argv[3:]))), flush=True)
+    except (DeviceError, KeyboardInterrupt) as error:
+        print("ended:", str(error) or "before anything was asked", flush=True)
 
-target = KukaPose(*map(float, sys.argv[3:]))
-KukaPose.from_matrix(target.matrix())  # the core has met its first array, which no signal may interrupt
-signal.signal(signal.SIGINT, stop)
-signal.signal(signal.SIGTERM, stop)
-robot = backend("robot", sys.argv[1])
-port = sys.argv[2] if sys.argv[1] == "serial" else int(sys.argv[2])
-client = robot(robot.Settings(port=port, allow_motion=True, timeout_s=1.0, reconnect_s=1.0))
-try:
-    print("ready", flush=True)
-    sys.stdin.readline()
-    print("arrived", client.move_to(target), flush=True)
-except (DeviceError, KeyboardInterrupt) as error:
-    print("ended:", str(error) or "before anything was asked", flush=True)
+boundary.run(move)
 """
 """Moves the flange, in a process of its own, when it is told to."""
 FAR = KukaPose(1690.825, -148.476, 981.652, -29.008, 23.236, 74.641)

@@ -88,7 +88,7 @@ def test_an_interrupt_at_any_moment_is_130_in_one_line(session, tmp_path, comman
     assert interrupted >= runs // 3
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_command_that_waits_ends_by_it(tmp_path, number):
     process = started("robot", "simulate", "--port", "0", stdin=subprocess.PIPE)
     assert json.loads(process.stdout.readline())["link"] == "kvp"
@@ -106,7 +106,14 @@ except BaseException:
 """
 
 
-@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+def test_a_system_without_threads_is_not_our_fault():
+    run = "from weldscan.faces.cli import boundary\ndef f(): raise RuntimeError(boundary.NO_THREAD)\nboundary.run(f)"
+    done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True, check=False, timeout=20)
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert "ulimit" in done.stderr
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_an_interrupt_never_falls_into_an_import(tmp_path, number):
     (tmp_path / "swallows.py").write_text(SWALLOWS.format(number=number))
     run = (

@@ -101,3 +101,26 @@ def test_where_nothing_can_be_written(tmp_path, run, words):
     for out in (tmp_path / "nothing" / "there", tmp_path):
         result = run(*words, "--config", str(config), "--out", str(out), catch_exceptions=True)
         assert isinstance(result.exception, InputError)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("robot", "watch", "--every", "inf"),
+        ("robot", "watch", "--every", "1e300"),
+        ("project", "--hold", "inf"),
+        ("project", "--pattern", "²"),
+        ("project", "--pattern", "٢"),
+        ("project", "--pattern", "256"),
+        ("project", "--pattern", "-0"),
+        ("robot", "simulate", "--speed", "inf"),
+        ("robot", "simulate", "--fault", "silence:9999999999999999999"),
+        ("robot", "simulate", "--fault", "silence:5_0"),
+        ("robot", "simulate", "--fault", "silence:0"),
+    ],
+)
+def test_numbers_on_the_command_line(tmp_path, run, words):
+    (tmp_path / "cell.toml").write_text('[robot]\nport = 1\n[projector]\nbackend = "simulated"\n')
+    config = () if words[1] == "simulate" else ("--config", str(tmp_path / "cell.toml"))
+    result = run(*words, *config, catch_exceptions=True)
+    assert isinstance(result.exception, InputError) or result.exit_code == 2, result.exception

@@ -315,3 +315,16 @@ def test_a_shot_is_written_while_the_robot_goes_to_the_next(scanned, tmp_path, m
     assert {"motion", "standing", "projector", "camera", "judging"} == set(manifest["record"]["seconds"])
     assert sum("can be measured" in what for what in scanned.said) == 3
     assert scanned.kept() == list(POSES)
+
+
+@pytest.mark.parametrize("name", ["shots", "set-aside"])
+def test_a_planted_folder_is_not_followed(cell, tmp_path_factory, name):
+    """Who may write beside us does not choose where our shots go, nor where we move what is damaged."""
+    theirs = tmp_path_factory.mktemp("theirs")
+    (cell.out / "shots" / "part-1" / "e1_000.png").unlink()
+    if name == "shots":
+        (cell.out / name).rename(cell.out / "was")
+    (cell.out / name).symlink_to(theirs)
+    with pytest.raises(InputError, match=f"{name}: is a link"):
+        cell.scan(resume=True)
+    assert list(theirs.iterdir()) == []

@@ -1,7 +1,11 @@
 """The simulated cell as devices: a camera that sees what the simulated projector shows, from where the robot stands.
 
-Camera and projector are two halves of one scanner, so they share what is shown (`_SHOWN`). Where the scanner is, the
-camera asks the simulated controller, as it would be known to the light: `controller` is a robot link of its own.
+Camera and projector are two halves of one scanner, so they share what is on the wall (`_WALL`). Where the scanner is,
+the camera asks the simulated controller, as it would be known to the light: `controller` is a robot link of its own.
+
+Time is as in a real cell: a pattern stands from the projector's next refresh on, a frame takes its exposure, and one
+that began too early shows the pattern before, or something of both. What a pose shows is computed once, for all
+patterns.
 """
 
 from __future__ import annotations
@@ -23,8 +27,9 @@ from weldscan.errors import DeviceError, InputError
 from weldscan.records.fields import explain
 from weldscan.simulated import DEFAULT, BoardCell, Cell, render
 
-_SHOWN: dict[str, NDArray[np.uint8]] = {}
-"""The one projector of the one simulated cell of this process."""
+_WALL: list[tuple[float, NDArray[np.uint8]]] = []
+"""The last images of the one simulated projector of this process, and since when each stands (monotonic clock)."""
+_REMEMBERED = 4
 
 
 class VirtualProjectorSettings(ProjectorSettings):
@@ -32,7 +37,8 @@ class VirtualProjectorSettings(ProjectorSettings):
 
     backend: Literal["simulated"] = "simulated"
     latency_s: Annotated[float, Field(ge=0, le=10)] = 0.0
-    guard_frames: Annotated[int, Field(ge=0, le=100)] = 0
+    guard_frames: Annotated[int, Field(ge=0, le=100)] = 1
+    """The next refresh is never further away."""
 
 
 class VirtualProjector(Projector):
@@ -47,11 +53,23 @@ class VirtualProjector(Projector):
 
     def close(self) -> None:
         """Switch it off."""
-        _SHOWN.clear()
+        _WALL.clear()
 
     def _show(self, image: NDArray[np.uint8]) -> float:
-        _SHOWN["image"] = image
-        return time.monotonic()
+        asked_s, hz = time.monotonic(), self.settings.refresh_hz
+        _WALL[:] = [*_WALL[1 - _REMEMBERED :], ((math.floor(asked_s * hz) + 1) / hz, image)]
+        return asked_s
+
+
+def _lit(began_s: float, ended_s: float) -> list[tuple[NDArray[np.uint8] | None, float]]:
+    """Each image that stood during an exposure, None being darkness, and its share of it."""
+    stood = [(-math.inf, None), *_WALL]
+    until = [*(since_s for since_s, _ in _WALL), math.inf]
+    shares = [
+        (image, (min(ended_s, to_s) - max(began_s, since_s)) / (ended_s - began_s))
+        for (since_s, image), to_s in zip(stood, until, strict=True)
+    ]
+    return [(image, share) for image, share in shares if share > 0]
 
 
 class VirtualCameraSettings(CameraSettings):
@@ -115,8 +133,21 @@ class VirtualCamera(Camera):
     def _set_exposure(self, exposure_s: float) -> float:
         return exposure_s
 
+    def prepare(self) -> None:
+        """Begin to compute what is seen from here; what goes wrong with it is told by the next question."""
+        self._own_thread().submit(self._render)
+
     def _grab(self, deadline_s: float) -> NDArray[Any]:
-        shown = _SHOWN.get("image")
+        began_s = time.monotonic()
+        time.sleep(self.exposure_s)
+        seen = [(share, self._see(image)) for image, share in _lit(began_s, began_s + self.exposure_s)]
+        if len(seen) == 1:
+            return seen[0][1]
+        mixed: NDArray[Any] = np.rint(sum(share * image for share, image in seen)).astype(seen[0][1].dtype)
+        return mixed
+
+    def _see(self, shown: NDArray[np.uint8] | None) -> NDArray[Any]:
+        """What the whole exposure shows of an image on the wall."""
         lens = self.cell.scanner.camera
         if shown is None:
             return np.zeros((lens.height, lens.width), np.uint8)

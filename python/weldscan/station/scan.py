@@ -238,15 +238,19 @@ class _Scan:
         for attempt in range(MOVED_ATTEMPTS):
             if attempt > 0:
                 self._go(shot)
+            wanted_s = [self.camera.settings.exposure_s * exposure * factor for exposure in relative]
+            with self.took("camera"):
+                set_exposure(self.camera, self.projector, wanted_s[0])
+                self.camera.prepare()
             with self.took("standing"):
                 before = self._standing()
             self._check_moved(shot, before)
             self._say(f"taking {shot.name}")
             started = time.strftime("%Y-%m-%dT%H:%M:%S%z")
             stacks, whites, actual = [], [], []
-            for exposure in relative:
-                wanted_s = self.camera.settings.exposure_s * exposure * factor
-                actual.append(set_exposure(self.camera, self.projector, wanted_s))
+            for exposure_s in wanted_s:
+                with self.took("camera"):
+                    actual.append(set_exposure(self.camera, self.projector, exposure_s))
                 *frames, white = capture_stack(self.camera, self.projector, self.patterns, self.took)
                 self._check_size(white)
                 stacks.append(frames)

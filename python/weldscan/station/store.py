@@ -79,6 +79,9 @@ class ShotStore:
         """
         self.folder, self.plan = folder, plan
         document = plan.model_dump(mode="json", exclude_none=True, by_alias=True)
+        for name in ("shots", ASIDE):  # whoever may write beside us does not choose where we write
+            if (folder / name).is_symlink():
+                raise InputError(f"{folder / name}: is a link, not followed; put the folder itself there")
         started = (folder / PLAN).is_file()
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: exists and is not a folder")

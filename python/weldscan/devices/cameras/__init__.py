@@ -45,11 +45,12 @@ class CameraSettings(BaseModel):
     retries: Annotated[int, Field(ge=0, le=100)] = 10
     """Further exposures after a torn frame."""
     trigger: Literal["software", "hardware"] = "software"
-    """hardware: the camera exposes on its trigger input, which the projector drives with every refresh. A question
-    then waits for the second exposure to end: the first may have begun before it.
-    """
+    """hardware: the camera exposes on its trigger input, which the projector drives with every refresh."""
     trigger_line: str = "Line1"
     """The camera's name of that input."""
+    transfer_s: Annotated[float, Field(ge=0, le=10)] = 0.1
+    """Of a camera that exposes without being asked (V4L2, hardware trigger): from the end of an exposure until its
+    frame is here, at most; `weldscan devices check` measures it."""
     bits: Literal[8, 10, 12, 14, 16] | None = None
     """Of the camera's numbers; absent: as its pixel format says."""
     width: Annotated[int, Field(ge=1)] | None = None
@@ -78,7 +79,7 @@ class Camera(abc.ABC):
     settings: CameraSettings
     name: str
     exposure_s: float = 0.0
-    streams: ClassVar[bool] = False
+    streams: bool = False
     """Whether it exposes without being asked: see `next_frame`."""
     _bits: int | None = None
     """As the pixel format says."""
@@ -100,7 +101,7 @@ class Camera(abc.ABC):
     def _grab(self, deadline_s: float) -> NDArray[Any]:
         """Return one exposure that began after the call; `TornFrame` where parts of it are missing."""
 
-    def _next(self) -> NDArray[Any]:
+    def _next(self, deadline_s: float) -> NDArray[Any]:
         """Return the next exposure as it comes, whenever it began; only where the camera streams."""
         raise NotImplementedError
 
@@ -124,6 +125,9 @@ class Camera(abc.ABC):
         self.exposure_s = actual
         return actual
 
+    def prepare(self) -> None:  # noqa: B027 - most cameras have nothing to prepare
+        """Told when the robot has come to where the next frames are taken: what takes time may begin."""
+
     def capture(self) -> Frame:
         """Return one whole frame whose exposure began after the call."""
         give_up_s = time.monotonic() + self.settings.timeout_s + self.exposure_s
@@ -139,7 +143,7 @@ class Camera(abc.ABC):
     def next_frame(self) -> Frame:
         """Return the next frame of a camera that streams: it may have begun long before the call."""
         give_up_s = time.monotonic() + self.settings.timeout_s + self.exposure_s
-        image = self._checked(self._in_time(give_up_s, self._next))
+        image = self._checked(self._in_time(give_up_s, lambda: self._next(give_up_s)))
         return Frame(image, time.monotonic(), 0, self.full_scale)
 
     @property

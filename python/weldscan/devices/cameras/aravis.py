@@ -52,7 +52,7 @@ class AravisCamera(Camera):
     settings: AravisSettings
 
     def __init__(self, settings: AravisSettings) -> None:
-        self.settings = settings
+        self.settings, self.streams = settings, settings.trigger == "hardware"
         self.name = f"camera {settings.device or 'aravis'}"
         self._bits = int(settings.pixel_format.removeprefix("Mono"))
         self._aravis, self._glib = _library()
@@ -73,11 +73,7 @@ class AravisCamera(Camera):
                     camera.gv_auto_packet_size()
             camera.set_acquisition_mode(self._aravis.AcquisitionMode.CONTINUOUS)
             camera.set_trigger("Software" if settings.trigger == "software" else settings.trigger_line)
-            self._stream = camera.create_stream(None, None)
-            payload = camera.get_payload()
-            for _ in range(BUFFERS):
-                self._stream.push_buffer(self._aravis.Buffer.new_allocate(payload))
-            camera.start_acquisition()
+            self._begin()
         self.set_exposure(settings.exposure_s)
 
     @classmethod
@@ -86,6 +82,14 @@ class AravisCamera(Camera):
         aravis, _ = _library()
         aravis.update_device_list()
         return [aravis.get_device_id(i) for i in range(aravis.get_n_devices())]
+
+    def _begin(self) -> None:
+        """Begin to acquire, into a stream of its own: what was under way to another arrives nowhere."""
+        self._stream = self._camera.create_stream(None, None)
+        payload = self._camera.get_payload()
+        for _ in range(BUFFERS):
+            self._stream.push_buffer(self._aravis.Buffer.new_allocate(payload))
+        self._camera.start_acquisition()
 
     def _close(self) -> None:
         with contextlib.suppress(self._glib.Error):  # it may be gone already
@@ -98,13 +102,16 @@ class AravisCamera(Camera):
             return float(self._camera.get_exposure_time()) * 1e-6
 
     def _grab(self, deadline_s: float) -> NDArray[Any]:
+        if self.streams:
+            time.sleep(self.exposure_s + self.settings.transfer_s)  # what began before the question is here then
         while (old := self._stream.try_pop_buffer()) is not None:  # nobody asked for these
             self._stream.push_buffer(old)
-        if self.settings.trigger == "software":
+        if not self.streams:
             with self._errors("trigger"):
                 self._camera.software_trigger()
-        else:
-            self._stream.push_buffer(self._next_buffer(deadline_s))  # it may have begun before the question
+        return self._next(deadline_s)
+
+    def _next(self, deadline_s: float) -> NDArray[Any]:
         buffer = self._next_buffer(deadline_s)
         try:
             status = buffer.get_status()
@@ -121,13 +128,17 @@ class AravisCamera(Camera):
 
     def _next_buffer(self, deadline_s: float) -> Any:
         wait_s = max(deadline_s - time.monotonic(), 0.001)
-        if self.settings.trigger == "software":
+        if not self.streams:
             wait_s = min(wait_s, self.exposure_s + FEATURE_WAIT_S)
         buffer = self._stream.timeout_pop_buffer(int(wait_s * 1e6))
         if buffer is None:
+            if not self.streams:  # a frame that comes late must not be the answer to the next question
+                with self._errors("trigger anew"):
+                    self._camera.stop_acquisition()
+                    self._begin()
             if time.monotonic() < deadline_s:
                 raise TornFrame(f"{self.name}: no frame after a trigger")
-            why = "is it unplugged?" if self.settings.trigger == "software" else "does the projector trigger it?"
+            why = "does the projector trigger it?" if self.streams else "is it unplugged?"
             raise DeviceTimeout(f"{self.name}: no frame: {why}")
         return buffer
 

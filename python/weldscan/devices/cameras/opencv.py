@@ -33,8 +33,6 @@ class OpenCvSettings(CameraSettings):
     gain: float | None = None
     queue: Annotated[int, Field(ge=0, le=64)] = 4
     """Frames that the driver may hold; V4L2 takes 4 buffers unless told otherwise."""
-    transfer_s: Annotated[float, Field(ge=0, le=10)] = 0.1
-    """From the end of an exposure until its frame is here, at most; `weldscan devices check` measures it."""
 
 
 class OpenCvCamera(Camera):
@@ -91,13 +89,13 @@ class OpenCvCamera(Camera):
             self._advance()
             if time.monotonic() > deadline_s:
                 raise DeviceTimeout(f"{self.name}: no frame in time")
-        return self._next()
+        return self._next(deadline_s)
 
     def _advance(self) -> None:
         if not self._capture.grab():  # which waits for 10 s, whatever the deadline: see `Camera._in_time`
             raise DeviceError(f"{self.name}: no frame: is it unplugged?")
 
-    def _next(self) -> NDArray[Any]:
+    def _next(self, deadline_s: float) -> NDArray[Any]:
         self._advance()
         whole, image = self._capture.retrieve()
         if not whole or image is None:

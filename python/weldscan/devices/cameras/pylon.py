@@ -41,7 +41,7 @@ class PylonCamera(Camera):
     settings: PylonSettings
 
     def __init__(self, settings: PylonSettings) -> None:
-        self.settings = settings
+        self.settings, self.streams = settings, settings.trigger == "hardware"
         self.name = f"camera {settings.serial_number or 'pylon'}"
         self._bits = int(settings.pixel_format.removeprefix("Mono"))
         self._pylon, self._genicam = _library()
@@ -105,21 +105,29 @@ class PylonCamera(Camera):
 
     def _grab(self, deadline_s: float) -> NDArray[Any]:
         pylon = self._pylon
+        if self.streams:
+            time.sleep(self.exposure_s + self.settings.transfer_s)  # what began before the question is here then
         try:
-            if self.settings.trigger == "software":
+            while (old := self._camera.RetrieveResult(0, pylon.TimeoutHandling_Return)).IsValid():
+                old.Release()  # nobody asked for these
+            if not self.streams:
                 wait_ms = int(max(deadline_s - time.monotonic(), 0.001) * 1000)
                 self._camera.WaitForFrameTriggerReady(wait_ms, pylon.TimeoutHandling_ThrowException)
                 self._camera.ExecuteSoftwareTrigger()
-            else:
-                while (old := self._camera.RetrieveResult(0, pylon.TimeoutHandling_Return)).IsValid():
-                    old.Release()  # nobody asked for these
-                self._retrieve(deadline_s).Release()  # it may have begun before the question
+        except self._genicam.GenericException as error:
+            raise DeviceError(f"{self.name}: {_first_line(error)}") from error
+        return self._next(deadline_s)
+
+    def _next(self, deadline_s: float) -> NDArray[Any]:
+        try:
             with self._retrieve(deadline_s) as result:
                 if not result.GrabSucceeded():
                     raise TornFrame(f"{self.name}: {result.GetErrorDescription()}")
                 image: NDArray[Any] = result.GetArray()
                 return image.copy()
         except self._genicam.TimeoutException as error:
+            self._camera.StopGrabbing()  # a frame that comes late must not be the answer to the next question
+            self._camera.StartGrabbing(self._pylon.GrabStrategy_OneByOne)
             raise DeviceTimeout(f"{self.name}: no frame in time") from error
         except self._genicam.GenericException as error:
             raise DeviceError(f"{self.name}: {_first_line(error)}") from error

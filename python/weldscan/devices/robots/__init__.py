@@ -20,7 +20,15 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from weldscan.devices.robots.kinematics import ArmGeometry
-from weldscan.devices.robots.plausible import Told, contradicted, jumped, out_of_reach
+from weldscan.devices.robots.plausible import (
+    HALF_TURN_DEG,
+    TURN_DEG,
+    Told,
+    beyond_a_turn,
+    contradicted,
+    jumped,
+    out_of_reach,
+)
 from weldscan.devices.robots.plausible import distance as distance
 from weldscan.devices.robots.wire import Cut, Deadline, Link, Transport
 from weldscan.errors import DeviceError, DeviceTimeout
@@ -134,7 +142,10 @@ class Robot(abc.ABC):
         told, s = Told(reading.flange(), reading.time_s, reading.joints_deg), self.settings
         arm = None if s.arm is None else ArmGeometry(*s.arm)
         wrong = (
-            out_of_reach(told.flange)
+            beyond_a_turn(reading.position, HALF_TURN_DEG)
+            or beyond_a_turn(reading.tool, TURN_DEG)
+            or beyond_a_turn(reading.base, TURN_DEG)
+            or out_of_reach(told.flange)
             or (self._last and jumped(self._last, told))
             or contradicted(told, KukaPose(*s.root).matrix(), arm, s.joints_within_mm, s.joints_within_deg)
         )
@@ -162,7 +173,7 @@ class Robot(abc.ABC):
             raise DeviceError(f"{self.name}: this link only reads")
         if not self.settings.allow_motion:
             raise DeviceError(f"{self.name}: motion is off; allow_motion = true in the configuration allows it")
-        if (wrong := out_of_reach(target)) is not None:
+        if (wrong := out_of_reach(target) or beyond_a_turn(target, TURN_DEG)) is not None:
             raise DeviceError(f"{self.name}: the target: {wrong}")
         try:
             reading = self.read()
@@ -211,6 +222,8 @@ class Robot(abc.ABC):
                 "Look at the robot"
             )
         try:
+            with contextlib.suppress(DeviceError):  # on a line without connections an old reply may still be on its way
+                self.pose(deadline)
             while True:
                 before = self.pose(deadline)
                 time.sleep(POLL_S)

@@ -19,6 +19,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, Literal
 
@@ -217,11 +218,15 @@ class KvpRobot(StreamRobot):
             raise DeviceError(f"{self.name}: {error}") from error
 
     def joints(self) -> tuple[float, ...]:
-        """Return A1 to A6, degrees."""
+        """Return A1 to A6, degrees, of a pose that is believed and that they hold."""
+        deadline = self._link.deadline()
+        reading = self.read(deadline)
         try:
-            return parse_e6axis(self.get("$AXIS_ACT")[0])
+            joints_deg = parse_e6axis(self.get("$AXIS_ACT", deadline=deadline)[0])
         except InputError as error:
             raise DeviceError(f"{self.name}: {error}") from error
+        self._believed(replace(reading, joints_deg=joints_deg))
+        return joints_deg
 
     def close(self) -> None:
         """Hang up."""

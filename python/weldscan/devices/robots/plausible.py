@@ -22,6 +22,7 @@ FASTEST_MM_S, FASTEST_DEG_S = 12_000.0, 2_500.0
 """No KUKA arm moves its flange faster (KR AGILUS: 11 m/s, and 2400 degrees/s if all its axes turned about one line)."""
 JUMP_SLACK_MM, JUMP_SLACK_DEG = 2.0, 1.0
 """Allowed on top of speed times time: readings are interpolated by the controller in cycles of up to 12 ms."""
+HALF_TURN_DEG, TURN_DEG, SLACK_DEG = 180.0, 360.0, 0.001
 LEVER_MM = 5_000.0
 """No joint of any KUKA is further from the flange: what a joint's turn can move it by, per radian."""
 SKEW_MM = 10.0
@@ -47,6 +48,17 @@ def out_of_reach(flange: KukaPose) -> str | None:
     far_mm = math.hypot(*flange.values()[:3])
     if far_mm > FARTHEST_MM or far_mm < NEAREST_MM:
         return f"the flange cannot be {far_mm:.4g} mm from the base"
+    return None
+
+
+def beyond_a_turn(pose: KukaPose, most_deg: float) -> str | None:
+    """Return which angle of a pose nobody would write, or None: a digit too many is another angle within a turn.
+
+    A controller tells A, B and C of $POS_ACT within half a turn to either side; people write up to a whole one.
+    """
+    for name, angle in zip("ABC", pose.values()[3:], strict=True):
+        if abs(angle) > most_deg + SLACK_DEG:
+            return f"{name} cannot be {angle:.6g} degrees"
     return None
 
 

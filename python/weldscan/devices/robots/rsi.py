@@ -20,7 +20,7 @@ from pydantic import Field
 
 from weldscan.devices.robots import Reading, Robot, RobotSettings, Six, rsi_answer
 from weldscan.devices.robots.rsi_answer import LARGEST_PACKET, REPORT
-from weldscan.devices.robots.wire import Deadline, Host, only, parse_xml
+from weldscan.devices.robots.wire import Address, Deadline, Host, only, parse_xml
 from weldscan.errors import DeviceError, DeviceTimeout, InputError
 from weldscan.pose import KukaPose, parse_number
 
@@ -38,7 +38,7 @@ class RsiSettings(RobotSettings):
     host: Host = "127.0.0.1"
     """The address of this computer that the controller sends to."""
     port: Annotated[int, Field(ge=0, le=65535)] = 64000
-    controller: str = "127.0.0.1"
+    controller: Address = "127.0.0.1"
     """Packets from any other address are ignored."""
     sen_type: Annotated[str, Field(pattern=r"^\w{1,32}$")] = "ImFree"
     only_send: bool = False

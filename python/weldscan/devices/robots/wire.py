@@ -8,6 +8,7 @@ never read further: the connection is dropped, and the next question opens a new
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import os
 import queue
 import re
@@ -31,6 +32,7 @@ Cut = Callable[[bytearray], bytes | None]
 
 LARGEST_MESSAGE = 65_536
 """Bytes: the largest message of any link here has about 1,000."""
+CLOSE_S = 0.5
 BEAT_S = 0.5
 """Whoever waits for a motion says so this often."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
@@ -48,7 +50,16 @@ def checked_host(host: str) -> str:
     return host
 
 
+def checked_address(address: str) -> str:
+    """An IPv4 address as packets carry it: a name would never be equal to one."""
+    try:
+        return str(ipaddress.IPv4Address(address))
+    except ValueError:
+        raise ValueError("should be an address such as 192.168.1.10, not a name") from None
+
+
 Host = Annotated[str, AfterValidator(checked_host)]
+Address = Annotated[str, AfterValidator(checked_address)]
 
 
 class Deadline:
@@ -309,9 +320,11 @@ class Link:
         self._drop()
 
     def close(self) -> None:
-        """Close the connection."""
-        with self._lock:
-            self._drop()
+        """Close the connection; whoever asks through it at the moment is not waited for."""
+        held = self._lock.acquire(timeout=CLOSE_S)
+        self._drop()
+        if held:
+            self._lock.release()
 
     def _stream(self, deadline_s: float) -> Messages:
         if self._messages is not None:

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from typing import Any, NoReturn
 
 OUR_FAULT, BAD_INPUT, NOT_MEASURED, INTERRUPTED = 1, 2, 5, 130
+STOPS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Ctrl-C, the end of the system, and that of a terminal or a remote session: what was begun is called back."""
+NO_THREAD = "can't start new thread"
 LATER_S = 0.02
 """How long an interrupt waits that came in the middle of what has to be whole, before it looks again."""
 
@@ -42,8 +45,8 @@ def run(command: Callable[[], object]) -> NoReturn:
     """Run a command and end the process with its exit code; whatever happens, at most one line of complaint.
 
     `command` gives 0, or what it passes to `sys.exit`. An error of the input or of the system (`WeldscanError`,
-    `OSError`, `RecursionError`, `UnicodeError`, `MemoryError`) is 2, `NotMeasured` 5, SIGINT and SIGTERM 130, anything
-    else weldscan's own fault, 1; WELDSCAN_TRACEBACK=1 shows where that came from.
+    `OSError`, `RecursionError`, `UnicodeError`, `MemoryError`) is 2, `NotMeasured` 5, SIGINT, SIGTERM and SIGHUP 130,
+    anything else weldscan's own fault, 1; WELDSCAN_TRACEBACK=1 shows where that came from.
     """
     stop = _Stop()
     stop.install()
@@ -73,8 +76,8 @@ def run(command: Callable[[], object]) -> NoReturn:
 
 
 class _Stop:
-    """SIGINT and SIGTERM: each is a KeyboardInterrupt while the command runs, but not in the middle of an import, which
-    libraries swallow or are left half imported by, nor of what else has to be whole: then it waits a moment.
+    """The signals of `STOPS`: each is a KeyboardInterrupt while the command runs, but not in the middle of an import,
+    which libraries swallow or are left half imported by, nor of what else has to be whole: then it waits a moment.
     """
 
     def __init__(self) -> None:
@@ -83,7 +86,7 @@ class _Stop:
 
     def install(self) -> None:
         """Take the signals over, but for one that whoever started the process has switched off."""
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in STOPS:
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self)
         sys.unraisablehook = self._lost
@@ -117,7 +120,7 @@ class _Stop:
             os._exit(INTERRUPTED)
         if self.armed:
             signal.setitimer(signal.ITIMER_REAL, 0)
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in STOPS:
             signal.signal(number, signal.SIG_IGN)
         sys.unraisablehook = self._unraisable
 
@@ -176,6 +179,8 @@ def _told(error: BaseException, struck: bool) -> tuple[int | str | None, str | N
             BAD_INPUT,
             f"not enough memory{': ' * bool(str(error))}{error}; give less at once, or more memory",
         )
+    if isinstance(error, RuntimeError) and str(error) == NO_THREAD:
+        return BAD_INPUT, "the system gives no more threads; raise its limits (ulimit -u, ulimit -v)"
     if isinstance(error, RecursionError):
         return BAD_INPUT, f"an input is nested too deeply: {error}"
     if isinstance(error, UnicodeError):

@@ -38,6 +38,8 @@ devices_app = _group("Camera and projector together.")
 
 Config = Annotated[Path, typer.Option("--config", help="The cell's configuration.")]
 CELL = Path("cell.toml")
+DAY_S = 86_400.0
+MOST_FAULTS = 1_000_000
 MODES = ("#T1", "#T2", "#AUT", "#EX")
 
 
@@ -60,7 +62,7 @@ def robot_pose(config: Config = CELL) -> None:
 @robot_app.command("watch")
 def robot_watch(
     config: Config = CELL,
-    every_s: Annotated[float, typer.Option("--every", min=0.0, help="Seconds between readings.")] = 0.2,
+    every_s: Annotated[float, typer.Option("--every", min=0.0, max=DAY_S, help="Seconds between readings.")] = 0.2,
     count: Annotated[int, typer.Option(min=0, help="How many; 0: until Ctrl-C.")] = 0,
 ) -> None:
     """Print the flange in base again and again."""
@@ -99,7 +101,7 @@ def robot_simulate(
         ),
     ] = None,
     pose: Annotated[str, typer.Option(help="The flange: X Y Z A B C, mm and degrees.")] = "",
-    speed: Annotated[float, typer.Option(min=0.1, help="mm/s")] = 250.0,
+    speed: Annotated[float, typer.Option(min=0.1, max=12_000.0, help="mm/s")] = 250.0,
     mode: Annotated[str, typer.Option(help="Operating mode: T1, T2, AUT or EX.")] = "T1",
     fault: Annotated[list[str] | None, typer.Option(help="FAULT or FAULT:COUNT for the next replies.")] = None,
 ) -> None:
@@ -169,7 +171,7 @@ def camera_preview(
 def project(
     config: Config = CELL,
     pattern: Annotated[str, typer.Option(help="white, black, a grey level, or all: the plan's fringes.")] = "white",
-    hold: Annotated[float, typer.Option(min=0.0, help="Seconds for each pattern; 0: until Ctrl-C.")] = 0.0,
+    hold: Annotated[float, typer.Option(min=0.0, max=DAY_S, help="Seconds for each pattern; 0: until Ctrl-C.")] = 0.0,
 ) -> None:
     """Show a pattern on the projector. On which display: x and y of the cell's [projector]."""
     from weldscan.devices.projectors.patterns import flat_pattern, fringe_patterns
@@ -179,17 +181,17 @@ def project(
     cell = read_cell(config)
     with cell.open("projector") as projector, contextlib.suppress(KeyboardInterrupt):
         size = projector.settings.width, projector.settings.height
-        levels = {"white": 255, "black": 0}
+        levels = {"white": 255, "black": 0, **{str(level): level for level in range(256)}}
         if pattern == "all":
             _, plan = read_settings(cell)
             patterns = list(fringe_patterns([f.pattern for f in plan.fringes], *size))
-        elif pattern in levels or (pattern.isdigit() and int(pattern) <= 255):
-            patterns = [flat_pattern(levels.get(pattern, int(pattern) if pattern.isdigit() else 0), *size)]
+        elif pattern in levels:
+            patterns = [flat_pattern(levels[pattern], *size)]
         else:
             raise InputError(f"--pattern: {pattern!r} is not white, black, all or a level from 0 to 255")
         for image in patterns:
             projector.show(image)
-            time.sleep(hold if hold > 0 else 86_400)
+            time.sleep(hold if hold > 0 else DAY_S)
 
 
 @devices_app.command("check")
@@ -327,11 +329,15 @@ def _obey_lines(controller: Controller) -> None:
 
 
 def _inject(controller: Controller, request: str) -> None:
+    from weldscan.pose import parse_whole
     from weldscan.simulated.controllers import LinkFault
 
     words = request.split()
     try:
-        controller.inject(LinkFault(words[0]), int(words[1]) if len(words) > 1 else 1)
+        count = parse_whole(words[1]) if len(words) > 1 else 1
+        if not 1 <= count <= MOST_FAULTS:
+            raise ValueError
+        controller.inject(LinkFault(words[0]), count)
     except (IndexError, ValueError):
         known = ", ".join(fault.value for fault in LinkFault)
         raise InputError(f"fault: {request.strip()!r} is not FAULT [COUNT] with one of {known}") from None

@@ -82,7 +82,7 @@ def test_hostile_streams_over_udp(soak):
 
 
 def test_stream_begins_again_only_after_silence(listener):
-    again, silence = hostile.honest(TRUE, 40, 40), [(1.0, 0, b"")]
+    again, silence = hostile.honest(TRUE, 40, 80), [(1.0, 0, b"")]
     assert len(believed_of(listener, BEGINNING + again)) == 111
     assert len(believed_of(listener, BEGINNING + silence + again)) == 111 + 31
     # The same packets once more are no new beginning, whatever silence is between.

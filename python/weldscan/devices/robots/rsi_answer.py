@@ -27,6 +27,9 @@ IPOC = re.compile(rb"<IPOC>\s*([0-9]{1,18})\s*</IPOC>")
 
 BEGINNING = 10
 """A stream is believed after so many packets that grew: a controller's first one may hold no pose yet (KR C2)."""
+BEGINNING_ANEW = 50
+"""A stream that begins anew is believed after so many: what was held up somewhere also comes after a silence, all at
+once, and on a machine that has other things to do a few packets of it may seem to keep time."""
 SILENCE_S = 0.5
 """A stream may begin anew, or from another port, only after none has come for so long; a controller that starts again
 takes a minute."""
@@ -38,6 +41,8 @@ DRIFT = 1e-3
 """Clocks differ by less than this share."""
 PACE = 0.5
 """A stream whose IPOC runs faster or slower than milliseconds by more than this share counts something else."""
+PACE_ANEW = 0.25
+"""The same of one that begins anew."""
 
 
 def answer(packet: bytes, sen_type: str) -> bytes | None:
@@ -85,7 +90,7 @@ class Order:
 
     IPOC grows with every packet. Who has sent ten that grew, steadily, is the controller, by address and port; from
     then on nobody else is heard, nothing that does not grow, and nothing that was seen before. Only when it has been
-    silent for half a second may a stream begin again, under the same conditions.
+    silent for half a second may a stream begin again, and has to be steady for longer.
     """
 
     def __init__(self) -> None:
@@ -130,11 +135,11 @@ class Order:
         if rivals:
             self.strangers += 1
             return False
-        if stream.grown < BEGINNING:
+        if stream.grown < (BEGINNING if self._locked is None else BEGINNING_ANEW):
             return False
         in_milliseconds = abs(stream.pace() - 1.0) < PACE
         if self._locked is not None:
-            if self._in_milliseconds and not in_milliseconds:
+            if self._in_milliseconds and abs(stream.pace() - 1.0) >= PACE_ANEW:
                 return False  # a backlog that comes all at once, or anything else but the same clock
             self.restarts += 1
         self._in_milliseconds = in_milliseconds

@@ -118,7 +118,7 @@ def inspect(
         history=history,
         accept_verification=accept_verification,
         required_coverage_deg=required,
-        cloud=cloud.value,
+        cloud=None if cloud is Cloud.cells else cloud.value,
     )
     with terminal.answer(EXIT_CODES[found.verdict]):
         if as_json:

@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicBool, AtomicPtr, Ordering};
 /// From this size on blocks are kept, and huge pages asked for: below, there is little to gain.
 const LARGE_BYTES: usize = 1 << 20;
 /// What is kept at most: the results of a shot of a few megapixels.
-const KEPT_BYTES: usize = 160 << 20;
+pub(super) const KEPT_BYTES: usize = 160 << 20;
 const KEPT_BLOCKS: usize = 48;
 /// Alignment of large blocks.
 const ALIGNED: usize = 16;
@@ -87,7 +87,7 @@ pub(super) fn asked(size: usize, ask: impl Fn() -> *mut u8) -> *mut u8 {
 }
 
 /// Gives the blocks that are kept back to the system, and tells whether there were any.
-fn give_back_kept() -> bool {
+pub(super) fn give_back_kept() -> bool {
     let Ok(mut kept) = KEPT.try_lock() else { return false };
     let count = std::mem::take(&mut kept.count);
     kept.bytes = 0;

@@ -9,12 +9,16 @@ use std::mem::MaybeUninit;
 #[cfg(target_os = "linux")]
 use std::ptr::null_mut;
 
-use crate::ground::allocator::{CUSHION_BYTES, is_to_be_had};
+use crate::ground::allocator::{CUSHION_BYTES, KEPT_BYTES, give_back_kept, is_to_be_had};
 use crate::ground::stop::{Stopped, poll, stop};
 
 /// Ends the call where the system has not the memory for `count` items of `bytes` each, all in all.
 pub(crate) fn require(count: usize, bytes: usize) {
     poll();
+    if count.saturating_mul(bytes) > KEPT_BYTES {
+        // What is so large finds no place in what is kept.
+        give_back_kept();
+    }
     match count.checked_mul(bytes) {
         Some(small) if small < CUSHION_BYTES => {}
         Some(size) if is_to_be_had(size) => {}

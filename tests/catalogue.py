@@ -428,6 +428,13 @@ def _(scale: float) -> Job:
     return lambda: ws.place_shots(step, [(shot, np.eye(4), 1)] * 2, 0.3)
 
 
+@job("WeldShot.points_mm")
+def _(scale: float) -> Job:
+    shot = ws.segment_weld(weld_shot(4 * scale), 315.0, 6.0)
+    some = np.arange(0, shot.labels.size, 7)
+    return lambda: shot.points_mm(some)
+
+
 @job("WeldStep.alone")
 def _(scale: float) -> Job:
     shot = ws.segment_weld(weld_shot(4 * scale), 315.0, 6.0)

@@ -15,7 +15,7 @@ use crate::error::Error;
 use crate::ground::transform::Vec3;
 use crate::python::call::{compute, raise};
 use crate::python::convert::vector;
-use crate::python::convert::{Whole, floats, parts};
+use crate::python::convert::{Whole, floats, parts, unmasked};
 use crate::python::seam::PySeam;
 use crate::weld::sections::Station;
 use crate::weld::segment::{self, Segmentation};
@@ -91,19 +91,16 @@ impl WeldShot {
     /// of a millimetre, for the shot keeps them in single precision. NaN where there is none. Raises InputError for a place beyond
     /// the last.
     fn points_mm<'py>(&self, py: Python<'py>, indices: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyArray2<f64>>> {
-        let (u, seam) = (&self.0.unrolled, &self.0.seam);
-        let indices: Vec<usize> =
-            parts::<Vec<Whole>>("indices", "whole numbers", indices)?.iter().map(|w| w.0).collect();
-        let mut flat = Vec::with_capacity(3 * indices.len());
-        for i in indices {
-            let Some((at, (across, height))) = u.at.get(i).zip(u.across_mm.get(i).zip(u.height_mm.get(i))) else {
-                let expected = format!("below {}", u.at.len());
-                return Err(raise(py, &Error::OutOfRange { what: "index of a point", expected, value: i.to_string() }));
-            };
-            let at = f64::from(*at);
-            let p = seam.point(at, f64::from(*across)) + seam.outward(at) * f64::from(*height);
-            flat.extend_from_slice(p.as_slice());
-        }
+        const NAME: &str = "indices";
+        unmasked(NAME, indices)?;
+        let indices: Vec<usize> = match indices.cast::<PyArray1<i64>>() {
+            // An array is not taken apart number by number; what lies below 0 is beyond the last.
+            Ok(array) => {
+                array.readonly().as_array().iter().map(|&i| usize::try_from(i).unwrap_or(usize::MAX)).collect()
+            }
+            Err(_) => parts::<Vec<Whole>>(NAME, "whole numbers", indices)?.iter().map(|w| w.0).collect(),
+        };
+        let flat = compute(py, || self.0.points(&indices))?;
         let n = flat.len() / 3;
         flat.into_pyarray(py).reshape([n, 3])
     }

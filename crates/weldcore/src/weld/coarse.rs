@@ -11,10 +11,9 @@ use crate::ground::stop::polled;
 use crate::ground::threads;
 use crate::ground::transform::Vec3;
 
-/// Pixels whose normals are looked for: where half of them hold nothing, one in thirty has its four neighbours.
+/// Normals that the coarse frame is found from: where half of the pixels hold nothing, one in thirty has its four neighbours. With
+/// 6000 the axis leans enough to blur what lies beside a dent.
 const COARSE_POINTS: f64 = 20_000.0;
-/// Normals that the coarse frame is found from: more would change nothing.
-const COARSE_NORMALS: usize = 6_000;
 
 /// Neighbours that a normal of a bare point is of.
 const CLOUD_NEIGHBOURS: usize = 16;
@@ -77,7 +76,6 @@ fn of_cloud(points: &[[f64; 3]]) -> Result<Vec<(Vec3, Vec3)>> {
 /// vote of `p - R n`, both then refined with the points that agree. Degrees and millimetres suffice.
 pub(super) fn coarse_frame(points: &[[f64; 3]], width: usize, nominal: &Nominal) -> Result<Seam> {
     let seen = if width == 1 || width == points.len() { of_cloud(points)? } else { of_grid(points, width) };
-    let seen: Vec<(Vec3, Vec3)> = seen.iter().step_by((seen.len() / COARSE_NORMALS).max(1)).copied().collect();
     require_count("part points with a normal", 100, seen.len())?;
     let axis = axis_from_normals(&seen, nominal)?;
     let middle = seen.iter().map(|(p, _)| p).sum::<Vec3>() / seen.len() as f64;

@@ -88,12 +88,13 @@ impl TakenCells {
         }
         let [from_mm, to_mm] = range.map(|mm| mm.clamp(-FURTHEST_MM, FURTHEST_MM));
         let around_mm = scans.iter().map(|s| s.seam.course.along_mm(std::f64::consts::TAU)).fold(0.0, f64::max);
-        let (along, across) = ((around_mm / cell_mm) as usize + 2, ((to_mm - from_mm) / cell_mm) as usize + 1);
-        let count = along.saturating_mul(across);
-        if count >= NOWHERE as usize {
+        let (along, across) = ((around_mm / cell_mm).floor() + 2.0, ((to_mm - from_mm) / cell_mm).floor() + 1.0);
+        let count = along * across;
+        if count.is_nan() || count >= f64::from(NOWHERE) {
             let expected = "so large that four thousand million cover the part".into();
             return Err(Error::OutOfRange { what: "cell_mm", expected, value: cell_mm.to_string() });
         }
+        let (across, count) = (across as usize, count as usize);
         require(count / 64 + 1, 8);
         Ok(Self { cell_mm, from_mm, across, count, taken: vec![0; count / 64 + 1] })
     }
@@ -192,9 +193,8 @@ pub fn place(scans: &[Scan], cell_mm: Option<f64>) -> Result<Placed> {
             |(s, part, (points, labels, deviations), (along, across, shots))| {
                 for (slot, &i) in part.iter().enumerate() {
                     let (i, u) = (i as usize, s.unrolled);
-                    let at = f64::from(u.at[i]);
-                    let on_wall = s.seam.point(at, f64::from(u.across_mm[i]));
-                    let p = s.base_from_scanner.apply(&(on_wall + s.seam.outward(at) * f64::from(u.height_mm[i])));
+                    let [at, across_mm, height] = [u.at[i], u.across_mm[i], u.height_mm[i]].map(f64::from);
+                    let p = s.base_from_scanner.apply(&s.seam.above(at, across_mm, height));
                     points[3 * slot..3 * slot + 3].copy_from_slice(p.as_slice());
                     labels[slot] = s.labels[i];
                     deviations[slot] = s.surface.deviation(u, i);

@@ -261,7 +261,12 @@ impl Seam {
 
     /// The point of the reference wall's surface at a place along and a distance across.
     pub fn point(&self, at: f64, across_mm: f64) -> Vec3 {
-        self.origin_mm + self.across * across_mm + self.outward(at) * self.course.radius_mm()
+        self.above(at, across_mm, 0.0)
+    }
+
+    /// The point so high over it: what [`Seam::place`] undoes.
+    pub fn above(&self, at: f64, across_mm: f64, height_mm: f64) -> Vec3 {
+        self.origin_mm + self.across * across_mm + self.outward(at) * (self.course.radius_mm() + height_mm)
     }
 
     /// Place along (an angle in [-π, π]), distance across and height (mm) of a point.

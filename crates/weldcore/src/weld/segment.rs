@@ -38,6 +38,26 @@ pub struct Segmentation {
     pub sections: Sections,
 }
 
+impl Segmentation {
+    /// Some of the points again, in the frame that they came in: x, y and z of each. The shot keeps them in single precision.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for a place beyond the last.
+    pub fn points(&self, indices: &[usize]) -> Result<Vec<f64>> {
+        let (u, seam) = (&self.unrolled, &self.seam);
+        let mut flat = Vec::with_capacity(3 * indices.len());
+        for &i in indices {
+            let Some((at, (across, height))) = u.at.get(i).zip(u.across_mm.get(i).zip(u.height_mm.get(i))) else {
+                let expected = format!("0 to {}", u.at.len().saturating_sub(1));
+                return Err(Error::OutOfRange { what: "index of a point", expected, value: i.to_string() });
+            };
+            let p = seam.above(f64::from(*at), f64::from(*across), f64::from(*height));
+            flat.extend_from_slice(p.as_slice());
+        }
+        Ok(flat)
+    }
+}
+
 /// Points further from the pipe than this many wall thicknesses are something else: neither a step nor the
 /// reinforcement of a weld comes near.
 const GATE_THICKNESSES: f64 = 2.0;

@@ -30,29 +30,30 @@ pub(crate) fn shell_term(distance_mm: f64, shell_mm: Option<f64>) -> f64 {
     (-x).exp() * (x.cos() + x.sin())
 }
 
-/// [`shell_term`] of many places: straight between values a tenth of a millimetre apart, which is off by a thousandth at most where
-/// `√(R t)` is 3 mm or more.
+/// [`shell_term`] of many places: straight between values so near that it is off by a millionth.
 pub(crate) struct ShellTable {
     values: Vec<f64>,
+    /// Entries per mm.
+    density: f64,
 }
 
 impl ShellTable {
-    const STEP_MM: f64 = 0.1;
+    const ENTRIES: usize = 4096;
     /// In `√(R t)`: what is left beyond is less than a thousandth.
     const REACH: f64 = 6.0;
 
     pub fn new(shell_mm: Option<f64>) -> Self {
-        let count = (Self::REACH * shell_mm.unwrap_or(0.0) / Self::STEP_MM).ceil() as usize + 2;
-        let term = |k: usize| shell_term(k as f64 * Self::STEP_MM, shell_mm);
-        let mut values: Vec<f64> = (0..count).map(term).collect();
-        values[count - 2..].fill(0.0);
-        Self { values }
+        let Some(shell_mm) = shell_mm else { return Self { values: vec![0.0; 2], density: 0.0 } };
+        let per_length = Self::ENTRIES as f64 / Self::REACH;
+        let mut values: Vec<f64> = (0..Self::ENTRIES).map(|k| shell_term(k as f64 / per_length, Some(1.0))).collect();
+        values.extend([0.0; 2]);
+        Self { values, density: per_length / shell_mm }
     }
 
     #[inline]
     pub fn at(&self, distance_mm: f64) -> f64 {
         let last = self.values.len() - 2;
-        let place = (distance_mm.abs() * (1.0 / Self::STEP_MM)).min(last as f64);
+        let place = (distance_mm.abs() * self.density).min(last as f64);
         // A shorter way than as usize, which asks for the largest numbers.
         let k = (place as i32 as usize).min(last);
         let [a, b] = [self.values[k], self.values[k + 1]];
@@ -227,13 +228,15 @@ mod tests {
 
     #[test]
     fn the_table_is_the_term() {
-        for shell_mm in [3.0, 12.0, 60.0] {
+        for shell_mm in [3.0, 12.0, 60.0, 1e200] {
             let table = ShellTable::new(Some(shell_mm));
-            let off = |k: i32| {
-                let z = 0.037 * f64::from(k) * shell_mm / 3.0;
+            let off = |part: f64| {
+                let z = part * shell_mm;
                 (table.at(z) - shell_term(z, Some(shell_mm))).abs()
             };
-            assert!((-900..900).map(off).fold(0.0, f64::max) < 1e-3, "{shell_mm}");
+            let parts = || (-900..900).map(|k| 0.0123 * f64::from(k));
+            assert!(parts().filter(|p| p.abs() < 5.9).map(off).fold(0.0, f64::max) < 2e-6, "{shell_mm}");
+            assert!(parts().map(off).fold(0.0, f64::max) < 1e-3, "{shell_mm}");
         }
         assert_eq!(ShellTable::new(None).at(0.0), 0.0);
     }

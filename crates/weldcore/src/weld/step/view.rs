@@ -87,8 +87,8 @@ pub(super) fn common_seam(shots: &[LabelledShot]) -> Result<Seam> {
         let mine: Vec<usize> = shot.walls().filter(|(_, other)| !other).map(|(i, _)| i).collect();
         for i in mine.iter().step_by(mine.len().div_ceil(each.max(1)).max(1)) {
             let u = shot.unrolled;
-            let (at, height) = (f64::from(u.at[*i]), f64::from(u.height_mm[*i]));
-            let p = shot.seam.point(at, f64::from(u.across_mm[*i])) + shot.seam.outward(at) * height;
+            let [at, across, height] = [u.at[*i], u.across_mm[*i], u.height_mm[*i]].map(f64::from);
+            let p = shot.seam.above(at, across, height);
             wall.push(base_from_scanner.apply(&p).into());
         }
     }

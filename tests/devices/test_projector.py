@@ -238,10 +238,10 @@ def test_display_gone_in_the_middle_of_a_scan(screen, tmp_path, monkeypatch):
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_window_killed_or_stuck(screen, number, monkeypatch):
     """A window that hangs, as it does behind an X server that hangs, ends in a time-out, however often it is asked."""
-    monkeypatch.setattr(window, "SHOW_S", 0.5)
     projector = backend("projector", "window")
     with projector(projector.Settings(x=X, width=WIDTH, height=HEIGHT)) as device:
         device.show(flat_pattern(9, WIDTH, HEIGHT))
+        monkeypatch.setattr(window, "SHOW_S", 0.5)
         device._process.send_signal(number)
         start = time.monotonic()
         with pytest.raises(DisplayGone if number == signal.SIGKILL else DeviceTimeout):
